@@ -491,7 +491,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
         ("quality no.vtu", "no such file"),
-        ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .pvtu, .msh or .msh2"),
+        ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality {lattice} --json no/a.json", "folder does not exist"),

@@ -14,6 +14,7 @@ from numpydoc.validate import validate
 from results import FOLDER, solved_model
 
 import tetopt
+from tetopt.io import formats
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = [name for name in tetopt.__all__ if name != "__version__"]
@@ -67,6 +68,7 @@ def fields_of(record):
 def test_examples_run(path, tmp_path, monkeypatch):
     """Each docstring's by itself, in a folder of its own, with numpy as np and tetopt at hand."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     if path.name == "frd.py":  # what CalculiX has written
         shutil.copy(FOLDER / "order_1.frd", "bar.frd")
         tetopt.save_mesh("bar.vtu", solved_model(1).mesh)

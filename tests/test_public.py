@@ -54,6 +54,7 @@ RIGHT = {
     "optimize_paper": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1},
     "quality": {"points": MESH.points, "cells": MESH.cells},
     "read_frd": {"path": "a.frd", "mesh": MESH},
+    "register_format": {"suffix": ".a", "write": str, "what": "a", "runs": True},
     "run": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
     "save_image": {"path": "a.nii", "image": IMAGE},
     "save_mesh": {"path": "a.vtu", "mesh": MESH, "cell_data": {}, "order": 1},

@@ -144,8 +144,6 @@ COMMANDS = """\
 phantom sphere -o a.nii.gz --voxel-mm 8 --labels l.nii.gz
 mesh a.nii.gz -o a.vtu --nodes 60 --iterations 1 --json a.json --young 0:1,255:6
 mesh a.nii.gz -o a.vtu --nodes 60 --iterations 1 --labels l.nii.gz --force
-mesh a.nii.gz -o b.pvtu --spacing 20 --iterations 0
-mesh a.nii.gz -o b.pvtu --spacing 20 --iterations 0 --force
 convert a.vtu a.vtk
 convert a.vtu a.vtk --force
 convert a.vtu a.inp --young 3

@@ -18,6 +18,7 @@ ORDER = (
     "own_phantom",
     "fields_on_voxels",
     "other_libraries",
+    "own_format",
 )
 
 

@@ -14,6 +14,7 @@ import pyvista
 from matplotlib import pyplot
 
 import tetopt
+from tetopt.io import formats
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 RESULT = EXAMPLES / "plot_calculix.frd"
@@ -45,6 +46,7 @@ NUMBERS = {
     "own_phantom": Number("volume_mm3", ".1f", "1120.7"),
     "other_libraries": Number("volume_mm3", ".1f", "33719.5"),
     "fields_on_voxels": Number("off_mm", ".4f", "0.0097"),
+    "own_format": Number("total_mN", ".1f", "409.6"),
     "slice_2d": Number("left_of_lattice", ".3f", "0.243"),
 }
 PROGRAMS = sorted(path.stem.removeprefix("plot_") for path in EXAMPLES.glob("*.py"))
@@ -79,6 +81,7 @@ def _run(name, folder, monkeypatch):
         shutil.copy(EXAMPLES / file, folder)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(pyvista, "OFF_SCREEN", True)
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     show, shown = pyvista.Plotter.show, []
     monkeypatch.setattr(pyvista.Plotter, "show", lambda *args, **look: shown.append(show(*args, **look)))
     output = io.StringIO()

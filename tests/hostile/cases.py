@@ -14,7 +14,7 @@ from hostile.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (
-    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply",
+    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".mfem", ".mesh", ".stl", ".ply",
 )  # fmt: skip
 # What a second mutation meets in a file whose format the first has damaged.
 LOST_FORMAT = (
@@ -201,11 +201,8 @@ def outside(draw):
         what = f"data outside: {draw.files[name][-60:]!r}"
         draw.files.pop("i.raw")
         return what, *with_image(draw, name, is_main=True)
-    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu", "p.pvtu")
+    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu")
     draw.good(name)
-    if name == "p.pvtu":
-        what, draw.files[name] = m.piece_outside(draw.rng, draw.files[name])
-        return what, *with_mesh(draw, name)
     what, draw.files[name] = m.xml_bomb(draw.rng, draw.files[name])
     return what, *with_mesh(draw, name)
 
@@ -285,15 +282,9 @@ def vtu(draw):
     return what, *with_mesh(draw, mesh)
 
 
-def pieces(draw):
-    """VTKHDF; a PVTU, one of whose files is damaged."""
-    names = ("h.vtkhdf",) if draw.rng.random() < 0.5 else ("p.pvtu", "p_0.vtu", "p_1.vtu")
-    for each in names:
-        draw.good(each)
-    name = draw.one(*names)
-    known = m.ANY if name == "h.vtkhdf" else (m.xml, m.xml, m.xml_depth, *m.ANY)
-    _, what = draw.bad(name, known)
-    return f"{name}: {what}", *with_mesh(draw, names[0])
+def vtkhdf(draw):
+    mesh, what = draw.bad("h.vtkhdf", m.ANY)
+    return what, *with_mesh(draw, mesh)
 
 
 def field_names(draw):
@@ -349,7 +340,6 @@ def label_tables(draw):
         (("convert", draw.good("m.vtu"), "out.inp", "--label-names", name), ("out.inp",)),
         (("convert", draw.good("m.vtu"), "out.feb", "--label-names", name), ("out.feb",)),
         (("convert", draw.good("m.vtu"), "out.msh", "--label-names", name), ("out.msh",)),
-        (("convert", draw.good("m.vtu"), "out.scn", "--label-names", name), ("out.scn",)),
         (("view", draw.good("m.vtu"), "--html", "v.html", "--label-names", name), ("v.html",)),
         (("surface", draw.good("m.vtu"), "-o", "s.ply", "--interfaces", "--label-names", name), ("s.ply",)),
     )
@@ -718,7 +708,7 @@ def lines(draw):
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
     dicom), "Zarr": (4, zarr_volumes), "pictures": (2, pictures),
-    "VTU": (7, vtu), "meshes in pieces": (4, pieces), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
+    "VTU": (7, vtu), "VTKHDF": (4, vtkhdf), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
     "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),

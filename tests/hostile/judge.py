@@ -185,11 +185,11 @@ def _problem(path: Path, suffix: str, case: Case) -> str:
     data = path.read_bytes()
     if not data:
         return "empty"
-    if suffix in (".vtu", ".feb", ".scn", ".xdmf", ".vtp"):
+    if suffix in (".vtu", ".feb", ".xdmf", ".vtp"):
         ET.fromstring(data)
-    if suffix in (".html", ".feb", ".scn", ".vtu", ".xdmf") and b"<script>hostile()" in data:
+    if suffix in (".html", ".feb", ".vtu", ".xdmf") and b"<script>hostile()" in data:
         return "markup let in"
-    if suffix in (".inp", ".feb", ".scn", ".msh", ".msh2", ".mesh", ".html") and re.search(
+    if suffix in (".inp", ".feb", ".msh", ".msh2", ".mesh", ".html") and re.search(
         rb"[\x00-\x08\x0b\x0c\x0e-\x1f]", data
     ):
         return "control characters in a text"

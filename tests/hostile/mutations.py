@@ -463,12 +463,6 @@ def outside(rng, data):
     return f"data in {target.decode()}", changed
 
 
-def piece_outside(rng, data):
-    """A piece of a mesh lies somewhere else: to be refused."""
-    target = one_of(rng, OUTSIDE)
-    return f"piece in {target}", data.replace(b'"p_1.vtu"', b'"%b"' % target.encode())
-
-
 # Of XML
 
 

@@ -175,13 +175,7 @@ def _write_meshes():
     _tetopt("fem", "m.vtu", "-o", "solved.vtu")
     _tetopt("mesh", "i.nii", "--slice", "k=5", "--nodes", "40", "--iterations", "1", "-o", "flat.vtu")
     loaded = tetopt.load_mesh("m.vtu")
-    cell_data = loaded.cell_data | {"part": np.arange(len(loaded.mesh.cells)) % 2}
-    for name in ("h.vtkhdf", "p.pvtu"):
-        tetopt.save_mesh(name, loaded.mesh, cell_data, {"tetopt": "0.1.0"})
-    for piece in sorted(Path("p").iterdir()):  # beside their master, where all files of a case are
-        piece.rename(piece.name)
-    Path("p.pvtu").write_bytes(Path("p.pvtu").read_bytes().replace(b'"p/p_', b'"p_'))
-    Path("p").rmdir()
+    tetopt.save_mesh("h.vtkhdf", loaded.mesh, loaded.cell_data, {"tetopt": "0.1.0"})
     mesh = meshio.read("m.vtu")
     bare = meshio.Mesh(
         mesh.points, mesh.cells, cell_data={"mean": mesh.cell_data["mean"], "label": mesh.cell_data["label"]}

@@ -11,20 +11,22 @@ import meshio
 import numpy as np
 import pytest
 from models import quadratic_model, sample_model
+from outlines import Outline, check_outline
 
 import tetopt
 from tetopt import InputError
+from tetopt.cli import main
 from tetopt.geometry.surface import extract_surface
-from tetopt.io import surfaces
+from tetopt.geometry.topology import boundary_facets
+from tetopt.io import formats, surfaces
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
-from tetopt.io.readback import OUTLINES, Outline, save_checked
 from tetopt.io.surfaces import checked_surface, save_surface
 from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
-XML_SUFFIXES = (".vtu", ".pvtu", ".xdmf", ".feb", ".scn")
+XML_SUFFIXES = (".vtu", ".xdmf", ".feb")
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -67,7 +69,9 @@ def saved(path, model):
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_no_name_breaks_a_file(suffix, tmp_path):
     """Each file is of text without control characters but line breaks, or tells no name at all but in bytes."""
-    text = saved(tmp_path / f"a{suffix}", hostile_model(suffix))
+    model = hostile_model(suffix)
+    text = saved(tmp_path / f"a{suffix}", model)
+    check_outline(suffix, text, expected_outline(suffix, len(model.mesh.points), len(model.mesh.cells), model.sets))
     head = text[: text.index(b"CELLS")] if suffix == ".vtk" else text[:80] if suffix == ".stl" else text
     head = head[: head.index(b"end_header")] if suffix == ".ply" else head
     if suffix == ".vtkhdf":
@@ -103,7 +107,7 @@ def test_braces_in_names_end_no_process(name, tmp_path):
             assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".pvtu", ".msh"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".msh"])
 def test_names_come_back(suffix, tmp_path):
     """As they were where they are printable text, else as Python escapes them; gmsh has no quotes, HDF5 no slashes."""
     model = hostile_model(suffix)
@@ -194,7 +198,7 @@ def test_sets_that_differ_by_case_alone_are_refused(tmp_path):
 def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     """What `save_mesh` writes is what the suffix says, or nothing."""
     mesh, path = sample_model().mesh, tmp_path / f"a{suffix}"
-    if suffix in (".feb", ".scn"):
+    if suffix == ".feb":
         with pytest.raises(InputError, match="material"):
             save_mesh(path, mesh)
         assert not path.exists()
@@ -203,7 +207,7 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     heads = {
         ".vtu": b"<?xml", ".vtk": b"# vtk", ".xdmf": b"<?xml", ".msh": b"$MeshFormat\n4.1", ".inp": b"** tetopt",
         ".msh2": b"$MeshFormat\n2.2", ".mfem": b"MFEM", ".mesh": b"MeshVersion", ".stl": b"tetopt", ".ply": b"ply",
-        ".vtkhdf": b"\x89HDF", ".pvtu": b"<?xml",
+        ".vtkhdf": b"\x89HDF",
     }  # fmt: skip
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
@@ -213,6 +217,15 @@ def test_a_suffix_of_no_format_is_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"unknown suffix; known are \.vtu .*, \.inp"):
         save_mesh(tmp_path / name, sample_model().mesh)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(tmp_path):
+    with pytest.raises(InputError, match=r"a\.pvtu: \.pvtu is not written; use \.vtkhdf"):
+        save_mesh(tmp_path / "a.pvtu", sample_model().mesh)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a.PVTU").write_text("<VTKFile/>")
+    with pytest.raises(InputError, match=r"a\.PVTU: \.pvtu is not read; save the mesh as \.vtkhdf"):
+        tetopt.load_mesh(tmp_path / "a.PVTU")
 
 
 def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
@@ -228,19 +241,73 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_names_that_are_words_of_a_format(suffix, tmp_path):
-    """What was written is gone through before it takes its name, so that this alone would notice."""
     words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End"]
     words += ["NumberOfPoints='1e99'", '<Piece NumberOfCells="7">', "last"]
     model = sample_model()
     fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
     about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}
     save_model(tmp_path / f"a{suffix}", model._replace(cell_data=fields, about=about, loads=()))
+    whole = (tmp_path / f"a{suffix}").read_bytes()
+    check_outline(suffix, whole, expected_outline(suffix, len(model.mesh.points), len(model.mesh.cells), model.sets))
     if suffix in VTK_SUFFIXES:
         back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
         assert all(np.array_equal(back[name], values) for name, values in fields.items())
 
 
-# What is written, read back
+# Formats of one's own
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Points as text under `.pts`; formats are as they were afterwards."""
+    monkeypatch.setitem(FORMATS, ".pts", None)
+    tetopt.register_format(".PTS", lambda model: f"é {model.units} {model.mesh.points.tolist()}\n", "points")
+
+
+@pytest.mark.filterwarnings("ignore")  # of a mesh as coarse as this
+def test_a_registered_format_is_written_alike_by_all(registered, tmp_path, capsys):
+    mesh = sample_model().mesh
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
+    tetopt.save_mesh(tmp_path / "a.pts", mesh)
+    whole = (tmp_path / "a.pts").read_text("utf-8")
+    assert whole == f"é kPa {mesh.points.tolist()}\n"
+    assert main(["convert", str(tmp_path / "a.vtu"), str(tmp_path / "b.pts")]) == 0
+    assert "points, RAS+ mm" in capsys.readouterr().out
+    assert (tmp_path / "b.pts").read_text("utf-8") == whole
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
+    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.pts", nodes=60, iterations=0))
+    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.vtu", nodes=60, iterations=0))
+    points = tetopt.load_mesh(tmp_path / "c.vtu").mesh.points
+    assert (tmp_path / "c.pts").read_text("utf-8") == f"é kPa {points.tolist()}\n"
+
+
+def test_what_a_registered_format_does_not_hold_is_refused(registered, tmp_path):
+    with pytest.raises(InputError, match=r"a\.pts: only \.vtu, .* take quadratic cells"):
+        save_model(tmp_path / "a.pts", quadratic_model())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
+    (tmp_path / "a.pts").write_text("old")
+
+    def broken(model):
+        raise RuntimeError("broken")
+
+    tetopt.register_format(".pts", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        save_model(tmp_path / "a.pts", sample_model())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".INP", "pts", "", ".", ".a/b", ".nii.gz", ".p\n"])
+def test_suffixes_that_no_format_can_have(suffix):
+    with pytest.raises(InputError, match=r"^suffix: (tetopt writes \.\w+ itself|expected a dot)") as caught:
+        tetopt.register_format(suffix, str)
+    assert "\n" not in str(caught.value)
+    assert suffix not in FORMATS.keys() - formats.BUILT_IN
+
+
+# All that a file holds
 
 
 def outlines():
@@ -267,39 +334,81 @@ def outlines():
 OUTLINED = [pytest.param(*each, id=f"{number}{each[0]}") for number, each in enumerate(outlines())]
 
 
-@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
-def test_outlines_tell_what_a_file_holds(suffix, whole, n_points, n_cells, sets):
-    outline = OUTLINES[suffix](whole)
-    if suffix in (".stl", ".ply", ".pvtu"):
-        return
-    assert outline.n_points == n_points
-    assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)
-    assert outline.facet_sets >= sets.facets.keys()
-    if suffix not in (".msh", ".msh2"):
-        assert outline.cell_sets >= sets.cells.keys()
+def expected_outline(suffix, n_points, n_cells, sets):
+    """What a file of a format tells of these: surfaces have nodes of their own, gmsh counts facets among the cells."""
+    if suffix in (".stl", ".ply") and sets.facets:
+        return Outline()
+    facet_sets, cell_sets = frozenset(sets.facets), frozenset(sets.cells)
+    return Outline(n_points, n_cells, facet_sets, cell_sets)
 
 
 @pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
-def test_damage_is_noticed(suffix, whole, n_points, n_cells, sets, tmp_path):
+def test_a_file_holds_all(suffix, whole, n_points, n_cells, sets):
+    outline = check_outline(suffix, whole, expected_outline(suffix, n_points, n_cells, sets))
+    if suffix == ".stl":
+        surface = boundary_facets(sample_model().mesh.cells)
+        assert outline.n_cells == len(surface)
+    elif suffix == ".ply":
+        surface = boundary_facets(sample_model().mesh.cells)
+        assert outline[:2] == (len(np.unique(surface)), len(surface))
+    else:
+        assert outline.n_points == n_points
+        assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)
+        assert outline.facet_sets is not None
+
+
+@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
+def test_an_outline_notices_damage(suffix, whole, n_points, n_cells, sets):
     """Wherever a file is cut off, and whichever line a text lacks."""
-    path, rng = tmp_path / f"a{suffix}", np.random.default_rng(len(whole))
-    expected = Outline(n_points, n_cells, frozenset(sets.facets), frozenset(sets.cells))
+    rng = np.random.default_rng(len(whole))
+    expected = expected_outline(suffix, n_points, n_cells, sets)
     if suffix in (".stl", ".ply"):
-        expected = OUTLINES[suffix](whole)
+        expected = check_outline(suffix, whole, expected)
     end = whole.index(b"*SURFACE, NAME=corner") if suffix == ".inp" else len(whole) - 8  # materials have no counts
     damaged = [whole[:length] for length in [0, 1, 50, *rng.integers(0, end, 20)]]
     if suffix in (".msh", ".msh2", ".mfem", ".mesh", ".xdmf"):
         lines = whole.splitlines(keepends=True)
         chosen = rng.choice([k for k, line in enumerate(lines) if line[:1].isdigit()], 20)
         damaged += [b"".join(lines[:k] + lines[k + 1 :]) for k in chosen]
-    path.write_bytes(b"old")
     for each in damaged:
-        with pytest.raises(OSError, match="cannot be written: what was made "):
-            save_checked(path, each, expected)
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
-    save_checked(path, whole, expected)
-    assert path.read_bytes() == whole
+        with pytest.raises(AssertionError, match=r"is not well-formed|instead of|lacks the set"):
+            check_outline(suffix, each, expected)
+
+
+def test_an_outline_notices_what_is_missing():
+    whole = file_bytes(Path("a.inp"), sample_model())
+    for expected, words in (
+        (Outline(facet_sets=frozenset({"boundary", "lost"})), "lacks the sets .*lost"),
+        (Outline(cell_sets=frozenset({"lost"})), "lacks the sets .*lost"),
+        (Outline(n_points=7), "holds .* instead of 7"),
+        (Outline(n_cells=7), "holds .* instead of 7"),
+    ):
+        with pytest.raises(AssertionError, match=words):
+            check_outline(".inp", whole, expected)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_the_order_of_bytes_in_memory_is_not_the_file_s(suffix):
+    """Data that come big-endian, as from NIfTI and MGH."""
+    model = sample_model()
+    swapped = model._replace(
+        cell_data={name: values.astype(values.dtype.newbyteorder(">")) for name, values in model.cell_data.items()}
+    )
+    assert file_bytes(Path(f"a{suffix}"), swapped) == file_bytes(Path(f"a{suffix}"), model)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_million_cells(suffix, tmp_path):
+    image = tetopt.Image(np.zeros((60, 60, 60)))
+    mesh = tetopt.lattice_mesh(image, blocks=(59, 59, 59))
+    assert len(mesh.cells) > 10**6
+    model = tetopt.build_model(mesh, image, young="2+h", loads=["compress:2%"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of nearly incompressible cells
+        save_model(tmp_path / f"a{suffix}", model)
+    whole = (tmp_path / f"a{suffix}").read_bytes()
+    check_outline(suffix, whole, expected_outline(suffix, len(mesh.points), len(mesh.cells), model.sets))
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".inp"])
@@ -311,17 +420,3 @@ def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="what was written reads back otherwise"):
         save_model(path, model)
     assert path.read_bytes() == b"old"
-
-
-def test_what_lacks_a_set_or_points_is_refused(tmp_path):
-    model = sample_model()
-    whole = file_bytes(tmp_path / "a.inp", model)
-    for expected, words in (
-        (Outline(facet_sets=frozenset({"boundary", "lost"})), "lacks the set lost"),
-        (Outline(cell_sets=frozenset({"lost"})), "lacks the set lost"),
-        (Outline(n_points=7), "holds .* points instead of 7"),
-        (Outline(n_cells=7), "holds .* cells instead of 7"),
-    ):
-        with pytest.raises(OSError, match=words):
-            save_checked(tmp_path / "a.inp", whole, expected)
-    assert list(tmp_path.iterdir()) == []

@@ -532,10 +532,10 @@ def test_a_missing_file(tmp_path, assert_refused):
 @pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.inp", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"named \.vtu, \.vtk, \.vtkhdf, \.pvtu, \.msh or \.msh2$")
+    assert_refused(tmp_path / name, r"named \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2$")
 
 
-@pytest.mark.parametrize("name", ["a.vtu", "a.vtk", "a.vtkhdf", "a.pvtu"])
+@pytest.mark.parametrize("name", ["a.vtu", "a.vtk", "a.vtkhdf"])
 @pytest.mark.parametrize(
     "raw",
     [b"", b"\n", b"no mesh at all", bytes(range(256)) * 20, b"<?xml version='1.0'?><html></html>"],

@@ -1,4 +1,4 @@
-"""Models as VTKHDF files: in pieces and whole, by our reader and VTK's; and what strangers may put into HDF5."""
+"""Models as VTKHDF files, by our reader and VTK's; others' in pieces; and what strangers may put into HDF5."""
 
 import sys
 import time
@@ -13,9 +13,8 @@ from tetopt.cli import main
 from tetopt.errors import InputError
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
-from tetopt.io.pieces import MOST_PIECES, joined, model_pieces
 from tetopt.io.vtk import vtu
-from tetopt.io.vtkhdf import hdf_pieces, vtkhdf
+from tetopt.io.vtkhdf import hdf_arrays, vtkhdf
 
 
 def in_parts(model, n_parts=3):
@@ -39,28 +38,12 @@ def same(back, other):
     return True
 
 
-@pytest.mark.parametrize("suffix", [".vtkhdf", ".pvtu"])
 @pytest.mark.parametrize(("make", "n"), [(sample_model, 2), (quadratic_model, 3)])
-def test_pieces_give_back_the_same_mesh(tmp_path, make, n, suffix):
-    """Cells and points of a piece are scattered over the whole, and yet all comes back in its order."""
+def test_it_gives_back_the_same_mesh(tmp_path, make, n):
     model = in_parts(make(n))
     (tmp_path / "a.vtu").write_bytes(vtu(model))
-    save_model(tmp_path / f"a{suffix}", model)
-    assert same(load_mesh(tmp_path / f"a{suffix}"), load_mesh(tmp_path / "a.vtu"))
-
-
-def test_other_readers_see_the_pieces(tmp_path):
-    model = in_parts(sample_model())
     save_model(tmp_path / "a.vtkhdf", model)
-    pieces = pyvista.read(tmp_path / "a.vtkhdf")
-    assert [np.unique(piece.cell_data["part"]).tolist() for piece in pieces] == [[-1], [0], [1]]
-    for piece in pieces:
-        chosen, nodes = piece.cell_data["GlobalCellIds"], piece.point_data["GlobalPointIds"]
-        np.testing.assert_array_equal(piece.points, model.mesh.points[nodes])
-        np.testing.assert_array_equal(nodes[piece.cells_dict[10]], model.mesh.cells[chosen])
-        np.testing.assert_array_equal(piece.cell_data["mean"], model.cell_data["mean"][chosen])
-        assert piece.n_points == len(np.unique(model.mesh.cells[chosen]))  # none that it does not use
-    assert sum(piece.n_cells for piece in pieces) == len(model.mesh.cells)
+    assert same(load_mesh(tmp_path / "a.vtkhdf"), load_mesh(tmp_path / "a.vtu"))
 
 
 def test_other_readers_see_one_piece(tmp_path):
@@ -70,7 +53,6 @@ def test_other_readers_see_one_piece(tmp_path):
     np.testing.assert_array_equal(grid.points, model.mesh.points)
     np.testing.assert_array_equal(grid.cells_dict[10], model.mesh.cells)
     np.testing.assert_array_equal(grid.field_data["facets:boundary"], model.sets.facets["boundary"])
-    assert "GlobalPointIds" not in grid.point_data
 
 
 def test_the_same_model_is_the_same_bytes():
@@ -90,95 +72,98 @@ def test_many_cells_are_packed(tmp_path):
     assert len(vtkhdf(model)) < 8 * n_columns * len(model.mesh.cells) / 10
 
 
-@pytest.mark.parametrize(
-    "part",
-    [lambda n: np.arange(n) + 0.5, lambda n: np.full(n, np.nan), lambda n: np.ones((n, 3)), lambda n: np.full(n, 7)],
-    ids=["halves", "NaN", "vectors", "one"],
-)
-def test_what_is_no_part_cuts_nothing(part):
-    model = sample_model()
-    model = model._replace(cell_data=model.cell_data | {"part": part(len(model.mesh.cells))})
-    assert len(list(model_pieces(model))) == 1
-
-
-def test_too_many_parts_are_refused(monkeypatch):
-    monkeypatch.setattr("tetopt.io.pieces.MOST_PIECES", 2)
-    assert MOST_PIECES > 2
-    with pytest.raises(InputError, match=r'^cell data "part": expected at most 2 parts, got 3; call it otherwise'):
-        list(model_pieces(in_parts(sample_model())))
-
-
-def test_data_that_are_called_as_ours_keep_their_values(tmp_path):
-    """They are numbered where the pieces' own have their name."""
-    model = in_parts(sample_model())
-    values = np.arange(len(model.mesh.cells))[::-1].copy()
-    save_model(tmp_path / "a.vtkhdf", model._replace(cell_data=model.cell_data | {"GlobalCellIds": values}))
-    back = load_mesh(tmp_path / "a.vtkhdf")
-    np.testing.assert_array_equal(back.cell_data["GlobalCellIds_2"], values)
-    np.testing.assert_array_equal(back.mesh.cells, model.mesh.cells)
-
-
 # Pieces of others
 
 
-def stripped(piece, *names):
-    return piece._replace(
-        point_data={name: values for name, values in piece.point_data.items() if name not in names},
-        cell_data={name: values for name, values in piece.cell_data.items() if name not in names},
-    )
+def write_pieces(path, pieces):
+    """A file as a parallel program writes it: of each piece its points, its cells as rows of points, and data."""
+    with h5py.File(path, "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = np.array([2, 0])
+        root.attrs["Type"] = np.bytes_("UnstructuredGrid")
+        root["NumberOfPoints"] = [len(points) for points, *_ in pieces]
+        root["NumberOfCells"] = [len(cells) for _, cells, *_ in pieces]
+        root["NumberOfConnectivityIds"] = [cells.size for _, cells, *_ in pieces]
+        root["Points"] = np.concatenate([points for points, *_ in pieces])
+        root["Types"] = np.concatenate([np.full(len(cells), 10, np.uint8) for _, cells, *_ in pieces])
+        root["Connectivity"] = np.concatenate([cells.ravel() for _, cells, *_ in pieces])
+        root["Offsets"] = np.concatenate([4 * np.arange(len(cells) + 1) for _, cells, *_ in pieces])
+        for group, column in (("PointData", 2), ("CellData", 3)):
+            into = root.create_group(group)
+            for name in pieces[0][column]:
+                into[name] = np.concatenate([piece[column][name] for piece in pieces])
 
 
-def test_pieces_without_numbers_are_joined_where_points_lie_at_one_place():
+def pieces_of(model):
+    """The cells of each part, and of each of their points the coordinates; all with data."""
+    for part in np.unique(model.cell_data["part"]):
+        chosen = np.flatnonzero(model.cell_data["part"] == part)
+        nodes, local = np.unique(model.mesh.cells[chosen], return_inverse=True)
+        yield model.mesh.points[nodes], local.reshape(-1, 4), {"node": nodes}, {"cell": chosen}
+
+
+def check_whole(back, model):
+    """All points once, and each cell on those that it was on."""
+    assert len(back.mesh.points) == len(model.mesh.points)
+    np.testing.assert_array_equal(back.mesh.points, model.mesh.points[back.point_data["node"]])
+    np.testing.assert_array_equal(back.point_data["node"][back.mesh.cells], model.mesh.cells[back.cell_data["cell"]])
+    assert sorted(back.cell_data["cell"]) == list(range(len(model.mesh.cells)))
+
+
+def test_pieces_are_joined_where_points_lie_at_one_place(tmp_path):
     model = in_parts(sample_model())
-    pieces = [stripped(each, "GlobalPointIds", "GlobalCellIds") for each in model_pieces(model)]
-    whole = joined(pieces)
-    assert len(whole.points) == len(model.mesh.points)
-    order = np.argsort(model.cell_data["part"], kind="stable")
-    places = whole.points[whole.connectivity].reshape(-1, 4, 3)
-    np.testing.assert_array_equal(places, model.mesh.points[model.mesh.cells[order]])
-    np.testing.assert_array_equal(whole.cell_data["mean"], model.cell_data["mean"][order])
-    first = np.unique(whole.connectivity, return_index=True)[1]
-    assert (whole.connectivity[np.sort(first)] >= 0).all()
+    pieces = list(pieces_of(model))
+    no_cells = (np.empty((0, 3)), np.empty((0, 4), np.int64))
+    nothing = (*no_cells, *({name: values[:0] for name, values in data.items()} for data in pieces[0][2:]))
+    write_pieces(tmp_path / "a.vtkhdf", [nothing, *pieces, nothing])
+    assert sum(len(points) for points, *_ in pieces) > len(model.mesh.points)
+    check_whole(load_mesh(tmp_path / "a.vtkhdf"), model)
 
 
-def test_points_at_one_place_in_one_piece_stay_apart():
+def test_points_at_one_place_in_one_piece_stay_apart(tmp_path):
     """As on the two lips of a slit, which the next piece goes on from."""
-    piece = next(model_pieces(sample_model()))
-    slit = piece._replace(points=np.concatenate([piece.points, piece.points[:1]]), point_data={})
-    slit.connectivity[-4:] = [len(piece.points), 1, 2, 3]
-    whole = joined([slit, slit])
-    assert len(whole.points) == len(slit.points)
-    np.testing.assert_array_equal(whole.connectivity.reshape(2, -1), [slit.connectivity] * 2)
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [0, 0, -1]])
+    lips = (points, np.array([[0, 1, 2, 3], [4, 2, 1, 5]]), {}, {})
+    write_pieces(tmp_path / "a.vtkhdf", [lips, lips])
+    back = hdf_arrays(str(tmp_path / "a.vtkhdf"))
+    assert len(back["points"]) == len(points)
+    cells = back["connectivity"].reshape(2, 2, 4)
+    np.testing.assert_array_equal(cells[0], cells[1])
+    assert cells[0, 0, 0] != cells[0, 1, 0]
+    np.testing.assert_array_equal(back["points"][cells[0]], points[lips[1]])
 
 
-def test_numbers_that_are_not_the_points_own_are_no_numbers():
-    """As where a program numbers each piece from 0 on: coordinates decide, and the numbers stay as data."""
+@pytest.mark.parametrize("n_pieces", [1, 4])
+def test_ghosts_are_left_out(tmp_path, n_pieces):
     model = in_parts(sample_model())
-    pieces = [
-        piece._replace(
-            point_data=piece.point_data | {"GlobalPointIds": np.arange(len(piece.points))},
-            cell_data=piece.cell_data | {"GlobalCellIds": np.arange(len(piece.cell_types))},
-        )
-        for piece in model_pieces(model)
-    ]
-    whole = joined(pieces)
-    assert len(whole.points) == len(model.mesh.points)
-    assert "GlobalPointIds" in whole.point_data
-    assert "GlobalCellIds" in whole.cell_data
+    own = list(pieces_of(model)) if n_pieces > 1 else [
+        (model.mesh.points, model.mesh.cells, {"node": np.arange(len(model.mesh.points))},
+         {"cell": np.arange(len(model.mesh.cells))})
+    ]  # fmt: skip
+    marked = [(p, c, at, of | {"vtkGhostType": np.zeros(len(c), np.uint8)}) for p, c, at, of in own]
+    points, cells, at, of = marked[0]
+    twice = (points, np.vstack([cells[:5], cells]), at, {
+        "cell": np.r_[of["cell"][:5], of["cell"]], "vtkGhostType": np.r_[np.ones(5), np.zeros(len(cells))].astype("u1")
+    })  # fmt: skip
+    write_pieces(tmp_path / "a.vtkhdf", [twice, *marked[1:]])
+    back = load_mesh(tmp_path / "a.vtkhdf")
+    check_whole(back, model)
+    assert "vtkGhostType" not in back.cell_data
 
 
-def test_ghosts_are_left_out_and_lost_data_told():
-    model = in_parts(sample_model())
-    pieces = list(model_pieces(model))
-    ghost = pieces[0]._replace(
-        cell_data=pieces[0].cell_data | {"vtkGhostType": np.ones(len(pieces[0].cell_types), "u1")}
-    )
-    none = np.zeros(len(pieces[1].cell_types), "u1")
-    pieces[1] = stripped(pieces[1]._replace(cell_data=pieces[1].cell_data | {"vtkGhostType": none}), "mean")
-    whole = joined([*pieces, ghost])
-    assert len(whole.cell_types) == len(model.mesh.cells)
-    assert whole.notes == ("data left out, as not every piece has them, of one type: mean",)
-    assert "mean" not in whole.cell_data
+def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
+    pieces = list(pieces_of(in_parts(sample_model())))
+    points, cells, *data = pieces[1]
+    beyond = cells.copy()
+    beyond[0, 0] = len(points)
+    write_pieces(tmp_path / "a.vtkhdf", [pieces[0], (points, beyond, *data), pieces[2]])
+    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: cells use nodes that their piece does not hold"):
+        load_mesh(tmp_path / "a.vtkhdf")
+    write_pieces(tmp_path / "a.vtkhdf", pieces)
+    with h5py.File(tmp_path / "a.vtkhdf", "r+") as file:
+        file["VTKHDF/Offsets"][len(pieces[0][1]) + 1] = 4
+    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: its cells, or its data, do not fit together"):
+        load_mesh(tmp_path / "a.vtkhdf")
 
 
 # Strangers' files
@@ -265,21 +250,21 @@ def test_what_no_file_needs_is_refused(file_path, name):
     with h5py.File(file_path, "r+") as file:
         change(file["VTKHDF"])
     with pytest.raises(InputError, match=words) as caught:
-        hdf_pieces(str(file_path))
+        hdf_arrays(str(file_path))
     assert "\n" not in str(caught.value)
 
 
 def test_texts_of_others_are_read(file_path):
     with h5py.File(file_path, "r+") as file:
         file["VTKHDF/FieldData"]["note"] = ["Größe", "b"]
-    assert hdf_pieces(str(file_path))[0]["field_data"]["note"].tolist() == ["Größe", "b"]
+    assert hdf_arrays(str(file_path))["field_data"]["note"].tolist() == ["Größe", "b"]
 
 
 def test_a_file_cut_off_and_cells_beyond_their_points(file_path):
     whole = file_path.read_bytes()
     with h5py.File(file_path, "r+") as file:
         file["VTKHDF/Connectivity"][0] = 10**6
-    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: cells of piece 0 use nodes that it does not hold"):
+    with pytest.raises(InputError, match=r"a\.vtkhdf: .*node"):
         load_mesh(file_path)
     file_path.write_bytes(whole[:-100])
     with pytest.raises(InputError, match="damaged, or not an HDF5 file") as caught:

@@ -45,7 +45,6 @@ KINDS = {
 FILES = {"mask", "labels", "start"}  # options that are files
 DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
 OF_FORMAT = {
-    ".scn": {"young": "2"},
     ".inp": {"young": "1 + 0.01*h", "loads": "compress:5%"},
     ".feb": {"young": "2", "loads": ["hold:superior"]},
 }

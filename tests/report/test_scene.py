@@ -3,12 +3,18 @@
 import numpy as np
 import PIL.Image
 import pytest
+import pyvista
 
 import tetopt
+from tetopt.geometry.cut import plane_cut
+from tetopt.model.labels import LabelTable
+from tetopt.report.exhibit import exhibit, opened_on, warp_factors
 from tetopt.report.scene import (
     STRUCTURE_COLOUR,
     _slice_sheet,
     dark_structure_surface,
+    opened_mesh,
+    plane_slice,
     save_scenes,
     slices_in_mesh,
     structure_before_slices,
@@ -71,3 +77,97 @@ def test_slice_sheet_shows_the_middle_slice_at_its_place():
         centre[:, axis] = image.shape[axis] // 2
         where = tuple(np.rint(centre).astype(int).T)
         np.testing.assert_allclose(sheet.cell_data["h"], image.data[where])
+
+
+# How `tetopt view` opens
+
+
+def drawn(shown):
+    """The parts of the scene, in the order in which they are drawn."""
+    plotter = pyvista.Plotter(off_screen=True)
+    opened_mesh(shown)(plotter)
+    mappers = [actor.mapper for actor in plotter.actors.values() if isinstance(actor, pyvista.Actor)]
+    for mapper in mappers:
+        mapper.GetInputAlgorithm().Update()  # as a frame would
+    return plotter, [mapper.dataset for mapper in mappers]
+
+
+def section_area(points, cells, axis, at):
+    corners = plane_cut(points, cells, points[:, axis] - at).corners
+    diagonals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return np.linalg.norm(diagonals, axis=1).sum() / 2
+
+
+def test_the_mesh_is_cut_across_its_middle(opengl, mesh, image):
+    values = np.random.default_rng(1).normal(50.0, 20.0, len(mesh.cells))
+    plotter, (behind, section, sheet) = drawn(exhibit(mesh, {"mean": values}, image))
+    axis, middle = int(np.argmin(np.ptp(mesh.points, axis=0))), (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    np.testing.assert_allclose(section.points[:, axis], middle[axis], atol=1e-5)
+    assert section.area == pytest.approx(section_area(mesh.points, mesh.cells, axis, middle[axis]), rel=1e-5)
+    assert behind.points[:, axis].max() == pytest.approx(middle[axis], abs=1e-4)
+    assert behind.points[:, axis].min() == pytest.approx(mesh.points[:, axis].min(), abs=1e-4)
+    np.testing.assert_allclose(sheet.bounds[2 * axis : 2 * axis + 2], middle[axis], atol=1e-6)
+    assert set(np.float32(section.cell_data["value"])) <= set(np.float32(values))
+    assert list(plotter.scalar_bars.keys()) == ["mean (intensity)"]
+    plotter.close()
+
+
+def test_labels_have_their_colours_and_names(opengl, mesh):
+    label = np.random.default_rng(1).integers(0, 4, len(mesh.cells))
+    table = LabelTable({1: "left $x$ lung"}, {1: (1.0, 0.0, 0.0)})
+    plotter, (behind, _) = drawn(exhibit(mesh, {"label": label}, table=table))
+    assert len(np.unique(behind.cell_data["value"], axis=0)) == 4
+    assert (behind.cell_data["value"] == [255, 0, 0]).all(axis=1).any()
+    assert len(plotter.scalar_bars.keys()) == 0
+    assert plotter.legend.GetNumberOfEntries() == 4
+    assert plotter.legend.GetEntryString(1).replace("\\$", "$") == " 1 left $x$ lung"
+    plotter.close()
+
+
+def test_a_mesh_with_displacements_is_deformed_and_the_image_is_left_out(opengl, mesh, image):
+    z = (mesh.points[:, 2] - mesh.points[:, 2].min()) / np.ptp(mesh.points[:, 2])
+    u = np.outer(z, [1.0, 0.5, 0.0])
+    shown = exhibit(mesh, {"rho": z[mesh.cells[:, 0]]}, image, point_data={"displacement": u})
+    plotter, (_, section) = drawn(shown)
+    points = mesh.points + warp_factors(shown)[0] * u
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    assert section.area == pytest.approx(section_area(points, mesh.cells, 2, middle[2]), rel=1e-5)
+    lengths = np.linalg.norm(u, axis=1)
+    value = section.point_data["value"]  # of the nodes, interpolated
+    assert lengths.min() < value.min() <= value.max() < lengths.max()
+    plotter.close()
+
+
+def test_a_picture_is_in_the_colours_asked_for(opengl, mesh, tmp_path):
+    """All cells in the colour of 50, at the ends of two ranges."""
+    shown = exhibit(mesh, {"mean": np.full(len(mesh.cells), 50.0)})
+    bright = []
+    for name, limits in (("a", (50.0, 80.0)), ("b", (20.0, 50.0))):
+        save_scenes(tmp_path / f"{name}.png", [("", opened_mesh(opened_on(shown, "mean", limits)))])
+        with PIL.Image.open(tmp_path / f"{name}.png") as picture:
+            pixels = np.asarray(picture.convert("RGB")).astype(int)
+        height, width = pixels.shape[:2]
+        middle = pixels[2 * height // 5 : 3 * height // 5, 2 * width // 5 : 3 * width // 5]
+        bright.append(np.median(middle[..., 1]))
+    assert bright[0] < 80 < 150 < bright[1]  # viridis runs from dark violet to yellow
+
+
+def test_hostile_names_are_drawn_letter_by_letter(opengl, mesh, tmp_path, capfd):
+    """VTK takes what is between dollars for a formula, and fails at bytes that are no UTF-8."""
+    for name in ("$\\frac{", "$x^2$", "a\x1b[31m\nb\udcff\u202e\0c", "%s%n <b>"):
+        save_scenes(tmp_path / "a.png", [("", opened_mesh(exhibit(mesh, {name: np.arange(len(mesh.cells)) + 0.5})))])
+    assert "MathText" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_slice_has_the_voxel_at_every_place(image, axis):
+    middle = image.to_world((np.array(image.shape) - 1) / 2)
+    sheet = plane_slice(image, axis, middle[axis] + 0.7)
+    places = sheet.cell_centers().points
+    np.testing.assert_allclose(places[:, axis], middle[axis] + 0.7)
+    index = image.to_index(places)
+    nearest = np.rint(index).astype(int)
+    inside = ((nearest >= 0) & (nearest < image.shape)).all(axis=1)
+    np.testing.assert_array_equal(np.isnan(sheet.cell_data["h"]), ~inside)
+    np.testing.assert_array_equal(sheet.cell_data["h"][inside], image.data[tuple(nearest[inside].T)])
+    assert inside.sum() * sheet.spacing[0] ** 2 > 200  # mm^2

@@ -45,7 +45,7 @@ COMMANDS = {
     ),
     "view": (
         "view",
-        "Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in a window or a page.",
+        "Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in the browser.",
     ),
     "phantom": ("phantom", "Write a phantom as an image: known shapes, known intensities."),
     "fem": ("fem", "Solve a mesh with its loads: displacements, stresses, strain energy, reactions."),

@@ -72,8 +72,6 @@ def checked_suffix(text: str) -> str:
     suffix = text.lower() if text.startswith(".") else f".{text.lower()}"
     if suffix not in FORMATS:
         raise InputError(f"--format: expected one of {', '.join(FORMATS)}, got {text}")
-    if FORMATS[suffix].write_files is not None:
-        raise InputError(f"--format: a subject's mesh is one file, {suffix} is several; take .vtkhdf")
     return suffix
 
 

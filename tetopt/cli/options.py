@@ -103,8 +103,10 @@ class SurfacePart:
 class ShownOptions:
     """How `tetopt view` shows a mesh, and where."""
 
-    html: Annotated[Path | None, option("OUT.html", "Write one page for a browser, open no window.", "--html")] = None
-    screenshot: Annotated[Path | None, option("OUT.png", "Write a picture of it, open no window.")] = None
+    html: Annotated[Path | None, option("OUT.html", "Write the page there, and open no browser.", "--html")] = None
+    screenshot: Annotated[Path | None, option("OUT.png", "Write how it opens as a picture, and open no browser.")] = (
+        None
+    )
     field: Annotated[
         str | None, option("NAME", "Colour by this at first: mean, label, von_mises, ... (default: the first).")
     ] = None

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
+import tempfile
+import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +35,7 @@ def view_command(
     part: BoxPart,
     force: ForceOption = False,
 ) -> int:
-    """Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in a window or a page.
+    """Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in the browser.
 
     A mesh with displacements is drawn deformed, by a factor that a slider changes; of quadratic cells the corners are.
     """
@@ -58,21 +62,25 @@ def view_command(
 
     shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table)
     shown = opened_on(shown, how.field or _only_labels(loaded), limits)
-    if html is None and screenshot is None:
-        from tetopt.report.window import show
-
-        show(shown)
     if screenshot is not None:
-        from tetopt.report.window import save_screenshot
+        from tetopt.report.scene import opened_mesh, save_scenes
 
-        save_screenshot(screenshot, shown)
+        save_scenes(screenshot, [("", opened_mesh(shown))])
         out.print(escape(str(screenshot)))
-    if html is not None:
+    if html is not None or screenshot is None:
         from tetopt.report.explore import save_explorer
 
-        save_explorer(html, shown)
-        out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
+        page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
+        save_explorer(page, shown)
+        words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
+        out.print(escape(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, needs nothing else"))
     return 0
+
+
+def _is_opened(page: Path) -> bool:
+    """Open a page in the browser; whether there is one. On Linux without a screen it would be one in this terminal."""
+    has_screen = not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return bool(has_screen) and webbrowser.open(page.as_uri())
 
 
 def _limits(text: str) -> tuple[float, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,16 +15,14 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
-from tetopt.io.pvtu import pvtu, pvtu_files
-from tetopt.io.readback import Outline, save_checked, save_pieces
-from tetopt.io.sofa import sofa
+from tetopt.io.readback import save_checked
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
-from tetopt.model.model import Model, elements, in_space, in_units, locking_words
+from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
@@ -31,27 +30,23 @@ class Format(NamedTuple):
     """What a suffix stands for."""
 
     what: str
-    write: Callable[[Model], bytes]
+    write: Callable[[Model], bytes | str]
     has_quadratic: bool = False
     runs: bool = False  # whether loads become a step that the solver runs; else they are words in the file
     is_surface: bool = False  # holds the boundary alone
     has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
     has_large: bool = False  # whether a step can ask for large deformation
-    # Of a mesh in several files, of which `write` makes the one that lists them: all of them by name, that one last.
-    write_files: Callable[[Model, str], Iterator[tuple[str, bytes]]] | None = None
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
     ".vtkhdf": Format("VTKHDF, ParaView", vtkhdf, has_quadratic=True, has_node_moduli=True),
-    ".pvtu": Format("VTU in pieces", pvtu, has_quadratic=True, has_node_moduli=True, write_files=pvtu_files),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
     ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True),
     ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True),
-    ".scn": Format("SOFA scene", sofa, runs=True),
     ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
     ".mesh": Format("medit", medit, has_quadratic=True),
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
@@ -59,6 +54,54 @@ FORMATS = {
 }
 # How formats whose readers take names of data of `MOST_NAME_CHARACTERS` show them.
 SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
+
+
+BUILT_IN = frozenset(FORMATS)
+
+
+def register_format(
+    suffix: str, write: Callable[[Model], bytes | str], what: str = "another format", *, has_quadratic: bool = False,
+    runs: bool = False, has_node_moduli: bool = False, has_large: bool = False,
+) -> None:  # fmt: skip
+    """Add a format that models are written in, for this process: by `save_model`, `run` and the command alike.
+
+    Parameters
+    ----------
+    suffix : str
+        Of its files, such as ".scn"; lower and upper case are the same.
+    write : callable
+        From a `Model` in the units and axes of the file to what is in it; text is encoded as UTF-8.
+    what : str
+        What the format is, for messages.
+    has_quadratic : bool
+        Whether it takes models of order 2; else they are refused, or written with linear cells.
+    runs : bool
+        Whether loads become a step that the solver runs; else the command says that they are words.
+    has_node_moduli : bool
+        Whether it takes moduli that vary within cells; else the command says that each cell has their mean.
+    has_large : bool
+        Whether a step can ask for large deformation.
+
+    Raises
+    ------
+    InputError
+        A suffix of another form, or of a format that tetopt has.
+
+    See Also
+    --------
+    save_model : Writes a model in the format of its file's suffix.
+
+    Examples
+    --------
+    >>> tetopt.register_format(".xyz", lambda model: "\\n".join(map(str, model.mesh.points.tolist())), "points")
+    >>> tetopt.save_mesh("ball.xyz", tetopt.lattice_mesh(tetopt.load_phantom("sphere").image(voxel_mm=4), nodes=300))
+    """
+    suffix = suffix.lower()
+    if not re.fullmatch(r"\.[a-z0-9_]+", suffix):
+        raise InputError(f'suffix: expected a dot, then letters and digits, such as .scn, got "{plain(suffix)}"')
+    if suffix in BUILT_IN:
+        raise InputError(f"suffix: tetopt writes {suffix} itself ({FORMATS[suffix].what}); take another")
+    FORMATS[suffix] = Format(what, write, has_quadratic, runs, False, has_node_moduli, has_large)
 
 
 def format_of(path: Path) -> Format:
@@ -70,6 +113,8 @@ def format_of(path: Path) -> Format:
         An unknown suffix, with the known ones.
     """
     suffix = path.suffix.lower()
+    if suffix == ".pvtu":
+        raise InputError(f"{path}: .pvtu is not written; use .vtkhdf, one file of any size that ParaView reads")
     if suffix not in FORMATS:
         known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
         raise InputError(f"{path}: unknown suffix; known are {known}")
@@ -77,12 +122,14 @@ def format_of(path: Path) -> Format:
 
 
 def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str = "kPa") -> None:
-    """Write a model in the format of the file's suffix, whole or not at all; it is read back before it takes its name.
+    """Write a model in the format of the file's suffix, whole or not at all.
+
+    What was written is compared with what reads back before the file takes its name.
 
     Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
     has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
-    become the same are numbered, and a warning tells what changed. Replaces an existing file, of .pvtu with its folder
-    of pieces; ask `tetopt.io.files.checked_output` first.
+    become the same are numbered, and a warning tells what changed. Replaces an
+    existing file; ask `tetopt.io.files.checked_output` first.
 
     Parameters
     ----------
@@ -122,12 +169,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """
     path = Path(path)
     kind, ready = format_of(path), _ready(path, model, space, units)
-    sets = (frozenset(each) for each in model.sets)
-    expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
-    if kind.write_files is None:
-        save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
-    else:
-        save_pieces(path, kind.write_files(ready, path.stem), expected)
+    save_checked(path, _encoded(kind.write(ready)))
     is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
     if is_for_solver and (words := locking_words(model)):
         warn(f"{path}: {words}")
@@ -187,14 +229,18 @@ def save_mesh(
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
-    """What `save_model` writes; of a format in several files that which lists the others, as if it were called "mesh".
+    """What `save_model` writes.
 
     Raises
     ------
     InputError
         As `save_model`.
     """
-    return format_of(path).write(_ready(path, model, space, units))
+    return _encoded(format_of(path).write(_ready(path, model, space, units)))
+
+
+def _encoded(whole: bytes | str) -> bytes:
+    return whole.encode() if isinstance(whole, str) else whole
 
 
 def _ready(path: Path, model: Model, space: str, units: str) -> Model:

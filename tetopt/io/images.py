@@ -29,10 +29,9 @@ from tetopt.errors import InputError, warn
 from tetopt.image import Image, VoxelGrid
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.files import PIECES_SUFFIX, check_suffix, written_whole
+from tetopt.io.files import check_suffix, written_whole
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
-from tetopt.io.pvtu import piece_names
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import (
     DAMAGED_FILE,
@@ -414,8 +413,6 @@ def sha256(path: str | Path) -> str:
 def image_files(path: Path) -> list[Path]:
     """The files that an image is in, other than one of Zarr's: itself, those beside a header, those in a folder.
 
-    Of a mesh in pieces they are its pieces, too.
-
     Raises
     ------
     InputError
@@ -428,9 +425,6 @@ def image_files(path: Path) -> list[Path]:
     if path.name.lower().endswith(HEADED_SUFFIXES):
         with contextlib.suppress(InputError):  # a header that cannot be read has none
             files += data_files(path)
-    if path.name.lower().endswith(PIECES_SUFFIX):
-        with contextlib.suppress(InputError):
-            files += [path.parent / source for source in piece_names(path)]
     return files
 
 

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.incoming import irregular
@@ -25,24 +22,12 @@ MOST_AXES = 8  # of a file: more than space, time, and what is measured
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
 VALUE_LETTERS = 32  # of text, for a byte of a value at most
 BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
-DTYPE_OF_TYPE = {
-    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
-    "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-    "signed char": "i1", "int8": "i1", "int8_t": "i1", "uchar": "u1", "unsigned char": "u1", "uint8": "u1",
-    "uint8_t": "u1", "short": "i2", "short int": "i2", "signed short": "i2", "signed short int": "i2", "int16": "i2",
-    "int16_t": "i2", "ushort": "u2", "unsigned short": "u2", "unsigned short int": "u2", "uint16": "u2",
-    "uint16_t": "u2", "int": "i4", "signed int": "i4", "int32": "i4", "int32_t": "i4", "uint": "u4",
-    "unsigned int": "u4", "uint32": "u4", "uint32_t": "u4", "longlong": "i8", "long long": "i8", "long long int": "i8",
-    "signed long long": "i8", "signed long long int": "i8", "int64": "i8", "int64_t": "i8", "ulonglong": "u8",
-    "unsigned long long": "u8", "unsigned long long int": "u8", "uint64": "u8", "uint64_t": "u8", "float": "f4",
-    "double": "f8",
+VALUE_BYTES = {  # of NRRD's words without "unsigned" and the like, and MetaImage's likewise
+    "char": 1, "int8": 1, "int8_t": 1, "short": 2, "short int": 2, "int16": 2, "int16_t": 2, "int": 4, "int32": 4,
+    "int32_t": 4, "long": 4, "longlong": 8, "long long": 8, "long long int": 8, "int64": 8, "int64_t": 8, "float": 4,
+    "double": 8,
 }  # fmt: skip
-# Fields that tell of values that are packed, text or several a voxel, and what they say of others.
-PLAIN_FIELDS = {
-    "CompressedData": ("false", "0"), "BinaryData": ("true", "1"), "ElementNumberOfChannels": ("1",),
-    "encoding": ("raw",), "line skip": ("0",), "lineskip": ("0",),
-}  # fmt: skip
+READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompressed .nii, of which parts are read"
 
 
 class VoxelHeader(NamedTuple):
@@ -52,18 +37,8 @@ class VoxelHeader(NamedTuple):
     value_bytes: int  # all voxels
     files: list[str]  # that have the voxels; none if they follow the header
     ratio: int  # the most that a byte of the file can become
-    dtype: str  # of a value, without its order of bytes
-    fields: dict[str, str]  # all, as they are written
+    skip: str  # bytes before the voxels, as it is written; -1 if the voxels are the last
     n_bytes: int  # of the header itself, where voxels follow
-
-
-class RawVoxels(NamedTuple):
-    """Where in a file voxels lie one after the other, the first axis the fastest."""
-
-    file: Path
-    dtype: np.dtype
-    offset: int  # bytes
-    sizes: tuple[int, ...]
 
 
 def checked_header(path: Path) -> tuple[int, int]:
@@ -77,7 +52,7 @@ def checked_header(path: Path) -> tuple[int, int]:
     """
     header = _header(path)
     n_bytes = _checked_bytes(path, header)
-    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1), READ_IN_PARTS)
     return n_bytes, header.value_bytes
 
 
@@ -90,57 +65,12 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
             f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
-    skip, longest = _skipped(header), VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
-    most = header.n_bytes + (int(skip) if skip.isdecimal() else 0) + longest * header.value_bytes + TRAILING_BYTES
+    longest = VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
+    skipped = int(header.skip) if header.skip.isdecimal() else 0
+    most = header.n_bytes + skipped + longest * header.value_bytes + TRAILING_BYTES
     if n_bytes > most:  # its checksum would be made of all of it
         raise InputError(TOO_LONG.format(most))
     return n_bytes
-
-
-def _skipped(header: VoxelHeader) -> str:
-    """How many bytes lie before the voxels, as it is written; -1 if the voxels are the last."""
-    return header.fields.get("byte skip", header.fields.get("byteskip", header.fields.get("HeaderSize", "0")))
-
-
-def raw_voxels(path: Path) -> RawVoxels:
-    """Where the voxels are, of an image that is not compressed and in one file.
-
-    Raises
-    ------
-    InputError
-        As `checked_header`, but for the memory; voxels that are compressed, text, or in several files.
-    """
-    header = _header(path)
-    for key, plain in PLAIN_FIELDS.items():
-        if header.fields.get(key, plain[0]).lower() not in plain:
-            raise InputError(
-                f"its voxels cannot be read in parts ({key}: {header.fields[key][:80]}); write it uncompressed, or "
-                "convert it to .zarr, first"
-            )
-    if len(header.files) > 1 or any("%" in name for name in header.files):
-        raise InputError("its voxels are in several files, and cannot be read in parts; convert it to one first")
-    file = (_data_files(path, header) or [path])[0]
-    _checked_bytes(path, header)
-    skip = _skipped(header)
-    if re.fullmatch(r"-1|\d{1,18}", skip) is None or (not header.files and "HeaderSize" in header.fields):
-        raise InputError(f"its voxels cannot be read in parts (they begin after {skip[:80]} bytes); write it again")
-    n_bytes = file.stat().st_size
-    offset = int(skip) + (0 if header.files else header.n_bytes) if skip != "-1" else n_bytes - header.value_bytes
-    if not 0 <= offset <= n_bytes - header.value_bytes:
-        raise InputError(f"{DAMAGED_FILE} (its voxels are to begin at byte {offset} of {n_bytes})")
-    return RawVoxels(file, np.dtype(_order(header) + header.dtype), offset, tuple(header.sizes))
-
-
-def _order(header: VoxelHeader) -> str:
-    """Of the bytes of a value: "<" or ">"; a MetaImage that does not tell is of a machine like this one, as in ITK."""
-    fields = header.fields
-    order = fields.get("endian", "").lower()
-    if "ElementType" in fields:
-        is_big = fields.get("ElementByteOrderMSB", fields.get("BinaryDataByteOrderMSB", str(sys.byteorder == "big")))
-        order = "big" if is_big.lower() in ("true", "1") else "little"
-    if order not in ("big", "little") and not header.dtype.endswith("1"):
-        raise InputError(f"{UNREADABLE_FILE} (its header does not tell the order of bytes)")
-    return ">" if order == "big" else "<"
 
 
 def data_files(path: Path) -> list[Path]:
@@ -220,9 +150,8 @@ def _metaimage(head: bytes) -> VoxelHeader:
     is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
     is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
     ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
-    dtype, end = _dtype_of(fields["ElementType"]), len(b"\n".join(lines[: number + 1])) + 1
-    value_bytes = math.prod(sizes) * int(channels) * np.dtype(dtype).itemsize
-    return VoxelHeader(sizes, value_bytes, files, ratio, dtype, fields, end)
+    value_bytes, end = math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]), lines[: number + 1]
+    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1)
 
 
 def _nrrd(head: bytes) -> VoxelHeader:
@@ -256,11 +185,15 @@ def _nrrd(head: bytes) -> VoxelHeader:
     for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
         if encoding in names.split():
             ratio = of_these
-    dtype, end = _dtype_of(fields["type"]), len(b"\n".join(raw[: number + 1])) + 1
-    return VoxelHeader(sizes, math.prod(sizes) * np.dtype(dtype).itemsize, files, ratio, dtype, fields, end)
+    value_bytes, skip = math.prod(sizes) * _value_bytes(fields["type"]), fields.get("byteskip", "0")
+    end = len(b"\n".join(raw[: number + 1])) + 1
+    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("byte skip", skip), end)
 
 
-def _dtype_of(kind: str) -> str:
-    if kind not in DTYPE_OF_TYPE:
+def _value_bytes(kind: str) -> int:
+    """Bytes of a value of a type."""
+    name = kind[4:].replace("_", " ").lower() if kind.startswith("MET_") else kind
+    name = re.sub("^(unsigned |signed |u)", "", name)
+    if name not in VALUE_BYTES:
         raise InputError(f"{UNREADABLE_FILE} (voxels of type {kind[:80]})")
-    return DTYPE_OF_TYPE[kind]
+    return VALUE_BYTES[name]

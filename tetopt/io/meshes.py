@@ -12,7 +12,6 @@ from tetopt.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, ro
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.incoming import regular_file
-from tetopt.io.pvtu import read_pvtu
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
@@ -35,7 +34,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     Parameters
     ----------
     path : str or Path
-        Its name ends as one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .pvtu, .msh, .msh2.
+        Its name ends as one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .msh, .msh2.
 
     Returns
     -------
@@ -61,6 +60,8 @@ def load_mesh(path: str | Path) -> MeshFile:
     (True, (1200,))
     """
     path = regular_file(path, "mesh file")
+    if path.suffix.lower() == ".pvtu":
+        raise InputError(f"{path}: .pvtu is not read; save the mesh as .vtkhdf or .vtu, as ParaView can")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: expected a mesh named {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]}")
     try:
@@ -170,7 +171,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 
 def _read_vtk(path: Path) -> Raw:
-    grid = {".vtkhdf": read_vtkhdf, ".pvtu": read_pvtu}.get(path.suffix.lower(), read_vtk)(path)
+    grid = (read_vtkhdf if path.suffix.lower() == ".vtkhdf" else read_vtk)(path)
     rows_of_kind = rows_by_kind(np.diff(grid.offsets), grid.cell_types)
     cells = cells_of_rows(grid.connectivity, grid.offsets, rows_of_kind)
     cell_data = {

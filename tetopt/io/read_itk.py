@@ -17,7 +17,7 @@ from tetopt.errors import InputError
 from tetopt.extras import install_hint
 from tetopt.incoming import irregular
 from tetopt.io.apart import read_apart
-from tetopt.io.itk_headers import HEADER_BYTES, checked_header
+from tetopt.io.itk_headers import checked_header
 from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
 
 # ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
@@ -41,13 +41,6 @@ def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float6
     size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
     data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=value_bytes, library="SimpleITK")
     return data, affine
-
-
-def itk_place(path: Path) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-    """Lengths of a file's axes and its affine, of which only the header is read; InputError as `read_itk`."""
-    _check_installed()
-    sizes, affine = read_apart(_place_of, path, size=HEADER_BYTES, library="SimpleITK")
-    return tuple(sizes), affine
 
 
 def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
@@ -82,14 +75,6 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
             reader.SetExtractSize([*size[:3], *(0 for _ in index)])
             reader.SetExtractIndex([0, 0, 0, *index])
         return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
-    except RuntimeError as error:
-        raise _in_words(error) from error
-
-
-def _place_of(path: str) -> tuple[list[int], NDArray[np.float64]]:
-    try:
-        reader = _reader_of(path)
-        return [int(size) for size in reader.GetSize()], _ras_affine(reader)
     except RuntimeError as error:
         raise _in_words(error) from error
 

@@ -24,13 +24,12 @@ from tetopt.io.images import (
     notes_of_size,
     os_errors_named,
 )
-from tetopt.io.itk_headers import HEADED_SUFFIXES, raw_voxels
-from tetopt.io.read_itk import itk_place
-from tetopt.io.volumes import VoxelsInFile, check_room, volume_index
+from tetopt.io.itk_headers import HEADED_SUFFIXES
+from tetopt.io.volumes import VoxelsInFile, check_room
 from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
-STORED_SUFFIXES = (ZARR_SUFFIX, ".nii", *HEADED_SUFFIXES)
+STORED_SUFFIXES = (ZARR_SUFFIX, ".nii")
 _PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
 
 
@@ -41,7 +40,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     ----------
     path : str or Path
         A folder of Zarr: an OME-Zarr image (NGFF 0.4, 0.5; Zarr's format 2 or 3), of whose multiscale the first level
-        is taken, or an array with the attribute "affine". An uncompressed file of NIfTI (.nii), NRRD or MetaImage.
+        is taken, or an array with the attribute "affine". An uncompressed file of NIfTI (.nii).
     volume : int, optional
         Which of several, from 0: of a file as in `tetopt.load_image`, of Zarr along its axes of time, channels
         and others, of which the last runs fastest.
@@ -161,7 +160,7 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
     if name.endswith(".nii"):
         return _mapped_nifti(path, volume, notes)
     if name.endswith(HEADED_SUFFIXES):
-        return _mapped_itk(path, volume)
+        raise InputError("is read whole, not in parts; convert it to .zarr or uncompressed .nii first")
     if name.endswith(_PACKED_SUFFIXES):
         raise InputError("is compressed, and cannot be read in parts; unpack it, or convert it to .zarr, first")
     raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
@@ -195,16 +194,3 @@ def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredIma
     voxels = VoxelsInFile(path, scaled, (*(slice(0, size) for size in shape[:3]), *index))
     voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
     return StoredImage(voxels, affine)
-
-
-def _mapped_itk(path: Path, volume: int | None) -> StoredImage:
-    raw = raw_voxels(path)
-    sizes, affine = itk_place(path)
-    if len(sizes) < 3:
-        raise InputError(f"expected a volume, got a plane of {sizes} voxels")
-    if sizes != raw.sizes:  # an axis of components, perhaps
-        raise InputError(f"cannot be read in parts: SimpleITK has {sizes} voxels of its {raw.sizes}; convert it first")
-    index = volume_index(sizes[3:], volume)
-    with os_errors_named():
-        array = np.memmap(raw.file, raw.dtype, "r", raw.offset, raw.sizes, order="F")
-    return StoredImage(VoxelsInFile(path, array, (*(slice(0, size) for size in sizes[:3]), *index)), affine)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, extract_surface
-from tetopt.io.readback import Outline, save_checked
+from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
 from tetopt.model.model import Model, half_turn
@@ -95,7 +95,7 @@ def save_surface(
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     whole = writers[path.suffix.lower()](surface, about, space, labels or {})
-    save_checked(path, whole, Outline(len(surface.points), len(surface.triangles)))
+    save_checked(path, whole)
 
 
 def boundary_stl(model: Model) -> bytes:

@@ -103,11 +103,11 @@ def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") ->
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
-def check_room(sizes: Sequence[int], value_bytes: int) -> None:
+def check_room(sizes: Sequence[int], value_bytes: int, remedy: str = "crop or resample it first") -> None:
     """InputError if one volume, of its first three axes, does not fit memory, as it is read and as an `Image`."""
     count = math.prod(sizes[:3])
     shape = " x ".join(str(size) for size in sizes[:3])
-    check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", "crop or resample it first")
+    check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", remedy)
 
 
 def one_line(words: object) -> str:

@@ -1,6 +1,6 @@
 """Meshes and models as VTK's files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
-What they hold is in `tetopt.io.vtkhdf` and `tetopt.io.pvtu`, too.
+What they hold is in `tetopt.io.vtkhdf`, too.
 
 Points in world mm, cells positively oriented, of one type: linear, or quadratic with straight edges, whose corners come
 first among the points. What is on each cell is cell data, on each point point data; with materials there is cell data
@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from tetopt.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.image import Image
 from tetopt.incoming import json_of
-from tetopt.io.raw import RawGrid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
@@ -41,31 +40,17 @@ from tetopt.model.sets import SET_NAME, Box, Sets
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkUnstructuredGrid
 
-VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf", ".pvtu")  # of files of ours that hold all of a model, and are read
+VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf")  # of files of ours that hold all of a model, and are read
 # Names of field data in our files, see above.
 FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
-def vtk_of(grid: RawGrid) -> vtkUnstructuredGrid:
-    """A grid of plain arrays, whose cells are all of one kind, as VTK's."""
-    cells = grid.connectivity.reshape(len(grid.cell_types), -1)
-    of_vtk = vtk_grid(grid.points, cells, int(grid.cell_types[0]), grid.cell_data, grid.point_data)
-    for name, values in grid.field_data.items():
-        add_array(of_vtk.GetFieldData(), name, values)
-    return of_vtk
-
-
 def vtu(model: Model) -> bytes:
     """A VTU file, exact, compressed."""
-    return vtu_bytes(model_grid(model))
-
-
-def vtu_bytes(grid: vtkUnstructuredGrid) -> bytes:
-    """A grid as a VTU file."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    return xml_bytes(vtkXMLUnstructuredGridWriter(), grid)
+    return xml_bytes(vtkXMLUnstructuredGridWriter(), model_grid(model))
 
 
 def vtk(model: Model) -> bytes:

@@ -1,10 +1,10 @@
-"""Meshes and models as VTKHDF files, which ParaView (from 5.12 on) and pyvista read: an HDF5 file, packed, in pieces.
+"""Meshes and models as VTKHDF files, which ParaView (from 5.12 on) and pyvista read: an HDF5 file, packed.
 
 Version 2.0 of the format, type UnstructuredGrid (docs.vtk.org, "VTKHDF file format"): group VTKHDF with the pieces'
 sizes (NumberOfPoints, NumberOfCells, NumberOfConnectivityIds) and their arrays one after another (Points, Connectivity,
-Offsets, Types), and the groups PointData, CellData and FieldData, in which is what `tetopt.io.vtk` says of .vtu, in
-pieces as `tetopt.io.pieces` cuts them. HDF5 has no slash in a name: data have "_" for it.
-VTK 9.7 reads field data from files of one piece alone; of several it shows sets by their point data `on_NAME`.
+Offsets, Types), and the groups PointData, CellData and FieldData, in which is what `tetopt.io.vtk` says of .vtu.
+HDF5 has no slash in a name: data have "_" for it. One piece is written (VTK 9.7 reads field data of no more); files of
+other programs are read in several.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.conversions import VTK_KINDS
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
-from tetopt.io.pieces import MOST_PIECES, joined, model_pieces
 from tetopt.io.raw import RawGrid
-from tetopt.io.read_vtk import checked_grid
+from tetopt.io.read_vtk import checked_grid, plain_arrays
 from tetopt.io.text import plain, short_name
+from tetopt.io.vtk import model_grid
 from tetopt.model.model import Model
 
 if TYPE_CHECKING:
@@ -34,7 +35,11 @@ LEAST_PACKED = 2**12  # bytes of an array that is packed: the index of its chunk
 BLOCK_BYTES = 2**24  # that the file grows by in memory
 # HDF5's own filters that a reader needs no further library for, by number: deflate, shuffle, Fletcher's checksum.
 DEFLATE_FILTER, PLAIN_FILTERS = 1, (1, 2, 3)
+MOST_PIECES = 2**16  # of a file: more than any cluster has cores for one job
+GHOST_FIELD, DUPLICATE_BIT = "vtkGhostType", 1  # VTK's, of cells that are another piece's and only repeated here
 COUNT_NAMES = ("NumberOfPoints", "NumberOfCells", "NumberOfConnectivityIds")
+ARRAYS = {"Points": "points", "Types": "cell_types", "Connectivity": "connectivity", "Offsets": "offsets"}
+ARRAY_KINDS = {"Points": np.float64, "Types": np.uint8, "Connectivity": np.int64, "Offsets": np.int64}
 DATA_GROUPS = {"PointData": "point_data", "CellData": "cell_data", "FieldData": "field_data"}
 
 
@@ -64,28 +69,27 @@ def vtkhdf(model: Model) -> bytes:
     Raises
     ------
     InputError
-        h5py is not installed; as `tetopt.io.pieces.model_pieces`.
+        h5py is not installed.
     """
     check_h5py()
     import h5py
 
-    pieces = list(model_pieces(model))
+    types = np.full(len(model.mesh.cells), VTK_KINDS[model.mesh.ndim, model.order], dtype=np.uint8)
+    grid = RawGrid(**plain_arrays(model_grid(model)), cell_types=types)
     options: Any = {"backing_store": False, "block_size": BLOCK_BYTES, "libver": ("earliest", "v110")}
     with h5py.File("in memory", "w", driver="core", **options) as file:
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array(FORMAT_VERSION, dtype=np.int64)
         root.attrs["Type"] = np.bytes_("UnstructuredGrid")
-        arrays = ("points", "cell_types", "connectivity")
-        for name, field in zip(COUNT_NAMES, arrays, strict=True):
-            _write(root, name, np.array([len(getattr(piece, field)) for piece in pieces], dtype=np.int64))
-        for name, field in zip(("Points", "Types", "Connectivity", "Offsets"), (*arrays, "offsets"), strict=True):
-            _write(root, name, np.concatenate([getattr(piece, field) for piece in pieces]))
+        sizes = (len(grid.points), len(grid.cell_types), len(grid.connectivity))
+        for name, size in zip(COUNT_NAMES, sizes, strict=True):
+            _write(root, name, np.array([size], dtype=np.int64))
+        for name, field in ARRAYS.items():
+            _write(root, name, getattr(grid, field))
         for group, field in DATA_GROUPS.items():
             into = root.create_group(group, track_order=True)
-            data = [getattr(piece, field) for piece in pieces]
-            for name, values in data[0].items():
-                whole = values if field == "field_data" else np.concatenate([each[name] for each in data])
-                _write(into, name, whole)
+            for name, values in getattr(grid, field).items():
+                _write(into, name, values)
         file.flush()
         return bytes(file.id.get_file_image())
 
@@ -100,7 +104,10 @@ def _write(group: h5py.Group, name: str, values: NDArray) -> None:
 
 
 def read_vtkhdf(path: Path) -> RawGrid:
-    """The mesh in a VTKHDF file, its pieces joined, see `tetopt.io.pieces.joined`.
+    """Read the mesh in a VTKHDF file.
+
+    Pieces are joined where their points lie at one place: the k-th point of one piece there is the k-th of the others.
+    Cells that a piece only repeats (VTK's ghosts) are left out.
 
     Raises
     ------
@@ -111,20 +118,19 @@ def read_vtkhdf(path: Path) -> RawGrid:
     check_h5py()
     if path.stat().st_size == 0:
         raise InputError("damaged: the file is empty")
-    pieces = read_apart(hdf_pieces, path, library="HDF5")
-    return joined([checked_grid("UnstructuredGrid", "", each) for each in pieces])
+    return checked_grid("UnstructuredGrid", "", read_apart(hdf_arrays, path, library="HDF5"))
 
 
 # In the child
 
 
-def hdf_pieces(path: str) -> list[dict[str, Any]]:
-    """The arrays of a `RawGrid` for each piece that has cells."""
+def hdf_arrays(path: str) -> dict[str, Any]:
+    """Return the arrays of a `RawGrid`, by name."""
     import h5py
 
     try:
         with h5py.File(os.fsencode(path), "r", locking=False) as file:
-            return _pieces_in(_Guarded(file, os.path.getsize(path)))
+            return _arrays_in(_Guarded(file, os.path.getsize(path)))
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError, TypeError, KeyError) as error:  # HDF5's own, of all kinds
@@ -201,7 +207,7 @@ class _Guarded:
         return [int(value) for value in values]
 
 
-def _pieces_in(file: _Guarded) -> list[dict[str, Any]]:
+def _arrays_in(file: _Guarded) -> dict[str, Any]:
     root = file.group(file.root, "VTKHDF")
     if root is None:
         raise InputError("expected a VTKHDF file, found HDF5 without a group VTKHDF")
@@ -216,35 +222,61 @@ def _pieces_in(file: _Guarded) -> list[dict[str, Any]]:
     n_points, n_cells, n_nodes = (file.counts(root, name) for name in COUNT_NAMES)
     if not len(n_points) == len(n_cells) == len(n_nodes):
         raise InputError("damaged: it has not as many pieces of points as of cells")
-    points = file.array(root, "Points")
-    arrays = {"points": (points, n_points), "cell_types": (file.array(root, "Types"), n_cells)}
-    arrays["connectivity"] = (file.array(root, "Connectivity"), n_nodes)
-    arrays["offsets"] = (file.array(root, "Offsets"), [n + 1 for n in n_cells])
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+    counts = dict(zip(ARRAYS, (n_points, n_cells, n_nodes, [n + 1 for n in n_cells]), strict=True))
+    arrays = {name: file.array(root, name) for name in ARRAYS}
+    if arrays["Points"].ndim != 2 or arrays["Points"].shape[1] != 3 or arrays["Points"].dtype.kind != "f":
         raise InputError("damaged: its points have not three coordinates each")
-    if any(values.ndim != 1 or values.dtype.kind not in "iu" for name, (values, _) in arrays.items() if name[0] != "p"):
+    if any(arrays[name].ndim != 1 or arrays[name].dtype.kind not in "iu" for name in ARRAYS if name != "Points"):
         raise InputError("damaged: its cells are no lists of whole numbers")
-    kinds = {"points": np.float64, "cell_types": np.uint8, "connectivity": np.int64, "offsets": np.int64}
-    cut = {name: _cut(values.astype(kinds[name]), counts, name) for name, (values, counts) in arrays.items()}
-    data: dict[str, dict[str, Any]] = {}
+    arrays = {name: _fitting(arrays[name], counts[name], name).astype(kind) for name, kind in ARRAY_KINDS.items()}
+    data: dict[str, dict[str, NDArray]] = {}
     for name, field in DATA_GROUPS.items():
         group = file.group(root, name)
         data[field] = {} if group is None else {str(each): file.array(group, each) for each in group}
-    for field, counts in (("point_data", n_points), ("cell_data", n_cells)):
-        data[field] = {name: _cut(values, counts, name) for name, values in data[field].items()}
-    chosen = [k for k, n in enumerate(n_cells) if n] or [0]
-    of_pieces = [
-        {name: parts[k] for name, parts in cut.items()}
-        | {field: {name: parts[k] for name, parts in data[field].items()} for field in ("point_data", "cell_data")}
-        | {"field_data": {}}
-        for k in chosen
-    ]
-    of_pieces[0]["field_data"] = data["field_data"]
-    return of_pieces
+    for field, sizes in (("point_data", n_points), ("cell_data", n_cells)):
+        data[field] = {name: _fitting(values, sizes, name) for name, values in data[field].items()}
+    return _joined(arrays, counts, data)
 
 
-def _cut(values: NDArray, counts: list[int], name: str) -> list[NDArray]:
-    """The pieces' parts of an array; InputError if it has not as many rows as they have."""
+def _fitting(values: NDArray, counts: list[int], name: str) -> NDArray:
+    """The array; InputError if it has not as many rows as the pieces have together."""
     if sum(counts) != len(values):
         raise InputError(f'damaged: "{plain(name)}" has {len(values)} rows, its pieces {sum(counts)}')
-    return np.split(values, np.cumsum(counts)[:-1])
+    return values
+
+
+def _joined(
+    arrays: dict[str, NDArray], counts: dict[str, list[int]], data: dict[str, dict[str, NDArray]]
+) -> dict[str, Any]:
+    """Number the points and cells of all pieces through, see `read_vtkhdf`."""
+    points, types, nodes, offsets = (arrays[name] for name in ARRAYS)
+    n_points, _, n_nodes, n_offsets = (np.array(counts[name], dtype=np.int64) for name in ARRAYS)
+    ends = np.cumsum(n_offsets)
+    if (offsets[ends - n_offsets] != 0).any() or (offsets[ends - 1] != n_nodes).any():
+        raise InputError("damaged: its cells, or its data, do not fit together")
+    sizes = np.delete(np.diff(offsets), ends[:-1] - 1)
+    if len(n_points) > 1:
+        if ((nodes < 0) | (nodes >= np.repeat(n_points, n_nodes))).any():
+            raise InputError("damaged: cells use nodes that their piece does not hold")
+        first, number = _same_by_place(points, np.repeat(np.arange(len(n_points)), n_points))
+        nodes = number[nodes + np.repeat(np.cumsum(n_points) - n_points, n_nodes)]
+        points = points[first]
+        data["point_data"] = {name: values[first] for name, values in data["point_data"].items()}
+    ghost = data["cell_data"].pop(GHOST_FIELD, np.zeros(len(types), dtype=np.uint8))
+    if ghost.ndim == 1 and ghost.dtype.kind in "iu" and (sizes >= 0).all():
+        is_own = (ghost & DUPLICATE_BIT) == 0
+        nodes, types, sizes = nodes[np.repeat(is_own, sizes)], types[is_own], sizes[is_own]
+        data["cell_data"] = {name: values[is_own] for name, values in data["cell_data"].items()}
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    return {"points": points, "cell_types": types, "connectivity": nodes, "offsets": starts} | data
+
+
+def _same_by_place(points: NDArray[np.float64], piece: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray]:
+    """For each point that is left the first that was listed, and of all listed its number."""
+    _, place = np.unique(points, axis=0, return_inverse=True)
+    run = place.ravel() * (piece[-1] + 1) + piece
+    order = np.argsort(run, kind="stable")
+    rank = np.empty(len(points), dtype=np.int64)  # among those of its piece there
+    rank[order] = np.arange(len(points)) - np.searchsorted(run[order], run[order])
+    key = np.column_stack([place.ravel(), rank]) @ np.array([len(points), 1])
+    return np.unique(key, return_index=True, return_inverse=True)[1:]

@@ -1,4 +1,4 @@
-"""What `tetopt view` shows, in a page (`tetopt.report.explore`) or in a window (`tetopt.report.window`)."""
+"""What `tetopt view` shows, in a page (`tetopt.report.explore`) or a picture (`tetopt.report.scene.opened_mesh`)."""
 
 from __future__ import annotations
 

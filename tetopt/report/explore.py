@@ -1,7 +1,6 @@
 """A page to explore a mesh with: cut it, colour it, pick cells out, beside its image; drawn by `explore*.js` in WebGL.
 
-One file without outside references, for someone who has nothing but a browser; `tetopt.report.window` is the same in
-pyvista's window.
+One file without outside references, for someone who has nothing but a browser.
 """
 
 from __future__ import annotations

@@ -8,19 +8,24 @@ from typing import Any
 
 import numpy as np
 import pyvista
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from tetopt.geometry.box import box_sides
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.files import check_suffix, written_whole
 from tetopt.mesh import Mesh
-from tetopt.report.colours import grey_limits
+from tetopt.report.colours import LISTED_LABELS, grey_limits, plain_text
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
 from tetopt.report.viewer import View
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
+GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell them, and the voxels show through
+MAX_PIXELS = 1024  # of the image's slice along either side: about the picture's
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
@@ -95,6 +100,112 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
         surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
         line_width=1, ambient=0.3,
     )  # fmt: skip
+
+
+def opened_mesh(shown: Exhibit) -> Draw:
+    """The mesh as `tetopt view` opens it: cut across its middle, in the colours of its first field, beside the image.
+
+    A mesh with displacements is drawn deformed, without the image, which is at rest.
+    """
+    field, (factor, _) = shown.fields[0], warp_factors(shown)
+    u = next(iter(shown.displacements.values()), None)
+    points = shown.mesh.points if u is None else shown.mesh.points + factor * u
+    image = shown.image if u is None else None
+    axis = first_axis(shown)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: shown.mesh.cells}, points)
+    look: dict[str, Any] = {"scalars": "value", "show_scalar_bar": False, "show_edges": True, "edge_color": MESH_LINE}
+    if field.categories:
+        grid.cell_data["value"] = _label_colours(field)
+        look["rgb"] = True
+    else:
+        (grid.cell_data if field.nodes is None else grid.point_data)["value"] = (
+            field.values if field.nodes is None else field.nodes
+        )
+        look |= {"cmap": COLOUR_MAP, "clim": field.limits, "nan_color": NO_VALUE}
+
+    def draw(plotter: pyvista.Plotter) -> None:
+        plotter.enable_parallel_projection()  # which has all of it in the picture
+        plane = {"normal": np.eye(3)[axis], "origin": middle}
+        behind, section = grid.extract_surface(algorithm="dataset_surface").clip(**plane), grid.slice(**plane)
+        if behind.n_cells:
+            plotter.add_mesh(behind, ambient=0.2, **look)
+        if section.n_cells:
+            plotter.add_mesh(section, lighting=False, opacity=1.0 if image is None else GLASS_OPACITY, **look)
+        if image is not None:
+            plotter.add_mesh(
+                plane_slice(image, axis, middle[axis]), scalars="h", cmap="gray", nan_opacity=0.0, lighting=False,
+                clim=grey_limits([image.data.astype(np.float64)]), show_scalar_bar=False,
+            )  # fmt: skip
+        _add_key(plotter, field)
+
+    return draw
+
+
+def _label_colours(field: Field) -> NDArray[np.uint8]:
+    """Red, green and blue of each cell's label (M, 3); `NO_VALUE` for values that are no label."""
+    colours = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(field.values), 1))
+    for label, colour in field.categories:
+        colours[field.values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
+    return colours.astype(np.uint8)
+
+
+def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
+    """What the colours stand for; of labels those that most cells have."""
+    title = plain_text(f"{field.name} ({field.unit})" if field.unit else field.name)
+    if not field.categories:
+        mapper = pyvista.DataSetMapper()
+        mapper.lookup_table = pyvista.LookupTable(COLOUR_MAP, scalar_range=field.limits)
+        plotter.add_scalar_bar(
+            title=title, mapper=mapper, color="black", fmt="%.4g", vertical=True, position_x=0.86, position_y=0.05,
+            height=0.35, width=0.06, title_font_size=18, label_font_size=16, render=False,
+        )  # fmt: skip
+        return
+    most = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))[:LISTED_LABELS]
+    entries = [
+        [plain_text(f" {label} {field.names.get(label, '')}".rstrip()), colour] for label, colour in sorted(most)
+    ]
+    if len(field.categories) > LISTED_LABELS:
+        entries.append([f" and {len(field.categories) - LISTED_LABELS} more", "#555555"])
+    plotter.add_legend(entries, bcolor="white", face="rectangle", size=(0.2, 0.03 * len(entries)))
+
+
+def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:
+    """The image in a world plane, in pixels of half the voxels' shortest edge: each has the voxel around its centre.
+
+    Parameters
+    ----------
+    image : Image
+        Three-dimensional.
+    axis : int
+        World axis across the plane, 0 for R-L, 1 for A-P, 2 for S-I.
+    at : float
+        Where the plane crosses it, mm.
+
+    Returns
+    -------
+    pyvista.ImageData
+        One layer of cells with data `h`, float64, NaN outside of the image; up to `MAX_PIXELS` along a side.
+    """
+    corners = np.stack(np.meshgrid(*box_sides(image.shape), indexing="ij"), axis=-1)
+    world = image.to_world(corners.reshape(-1, 3))
+    low, high = world.min(axis=0), world.max(axis=0)
+    pixel = max(float(image.spacing.min()) / 2.0, float(np.delete(high - low, axis).max()) / MAX_PIXELS)
+    counts = np.maximum(np.ceil((high - low) / pixel - 1e-9).astype(np.int64), 1)
+    counts[axis] = 1
+    low[axis] = at
+    centres = [low[k] + pixel * (np.arange(counts[k]) + 0.5) for k in range(3)]
+    centres[axis] = np.array([at])
+    index = image.to_index(np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1))
+    voxel = np.floor(index + 0.5).astype(np.int64)
+    is_inside = ((voxel >= 0) & (voxel < image.shape)).all(axis=-1)
+    h = np.full(voxel.shape[:3], np.nan)
+    h[is_inside] = image.data[tuple(voxel[is_inside].T)]
+    dimensions = counts + 1
+    dimensions[axis] = 1
+    sheet = pyvista.ImageData(dimensions=dimensions, spacing=(pixel,) * 3, origin=low)
+    sheet.cell_data["h"] = h.ravel(order="F")
+    return sheet
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:

@@ -1,0 +1,124 @@
+"""
+Write a format of your own
+==========================
+
+A solver that tetopt has no writer for takes a function from a model to text, and one line that registers it. Here it
+is SOFA: a scene with the mesh, a modulus for each cell, supports, forces and springs. No SOFA has run it here.
+"""
+
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pyvista
+
+import tetopt
+from tetopt.model.loads import facet_forces, spring_constants
+
+# %%
+# A model has points in mm, cells, sets of facets as rows (cell, node opposite), materials and loads. `repr` writes a
+# number without losing a digit. Each load becomes one object of SOFA; what a scene cannot carry is refused in a line.
+
+
+def listed(numbers):
+    """Numbers as text."""
+    return " ".join(map(repr, np.asarray(numbers).ravel().tolist()))
+
+
+def nodes_of(model, name):
+    """The nodes of a set of facets."""
+    cell, opposite = model.sets.facets[name].T
+    is_other = np.arange(4) != opposite[:, None]
+    return np.unique(model.mesh.cells[cell][is_other])
+
+
+def load_of(model, load):
+    """The component of SOFA's that a load becomes, and its values."""
+    if load.kind == "spring":
+        nodes, stiffness = spring_constants(model.mesh, model.sets, load)
+        return "RestShapeSpringsForceField", {"points": listed(nodes), "stiffness": listed(stiffness)}
+    if load.kind != "displacement":
+        nodes, forces = facet_forces(model.mesh, model.sets, load)
+        return "ConstantForceField", {"indices": listed(nodes), "forces": listed(forces)}
+    indices = listed(nodes_of(model, load.set_name))
+    if np.isnan(load.numbers).any():
+        raise tetopt.InputError("sofa: a set moves in all directions or in none; give numbers instead of free")
+    if not load.numbers.any():
+        return "FixedProjectiveConstraint", {"indices": indices}
+    path = listed([[0, 0, 0], load.numbers, load.numbers])  # from 0 to 1 s, and held from then on
+    return "LinearMovementProjectiveConstraint", {"indices": indices, "keyTimes": "0 1 1e9", "movements": path}
+
+
+def sofa(model):
+    """A scene for SOFA v24.12, which rests in equilibrium at t = 2 s."""
+    if model.mesh.ndim != 3 or model.materials is None or any(load.step for load in model.loads):
+        raise tetopt.InputError("sofa: expected tetrahedra, a law of the modulus (`young`) and loads of one step")
+    mesh, materials = model.mesh, model.materials
+    gravity = sum((load.numbers for load in model.loads if load.kind == "gravity"), np.zeros(3))
+    root = ET.Element("Node", name="root", dt="0.1", gravity=listed(gravity))
+    for plugin in (
+        "Constraint.Projective", "LinearSolver.Direct", "Mass", "MechanicalLoad", "ODESolver.Backward",
+        "SolidMechanics.FEM.Elastic", "SolidMechanics.Spring", "StateContainer", "Topology.Container.Dynamic",
+    ):  # fmt: skip
+        ET.SubElement(root, "RequiredPlugin", name=f"Sofa.Component.{plugin}")
+    ET.SubElement(root, "DefaultAnimationLoop")
+    solid = ET.SubElement(root, "Node", name="solid")
+    ET.SubElement(solid, "EulerImplicitSolver")
+    ET.SubElement(solid, "SparseLDLSolver", template="CompressedRowSparseMatrixMat3x3")
+    ET.SubElement(
+        solid, "TetrahedronSetTopologyContainer", name="mesh", position=listed(mesh.points),
+        tetrahedra=listed(mesh.cells),
+    )  # fmt: skip
+    ET.SubElement(solid, "TetrahedronSetGeometryAlgorithms", template="Vec3")
+    ET.SubElement(solid, "MechanicalObject", name="dofs", template="Vec3", position="@mesh.position")
+    density = np.full(1, 1000.0) if materials.density is None else materials.density  # water's, kg/m3
+    if np.ptp(density) > 0.0:
+        raise tetopt.InputError("sofa: expected one density for all cells")
+    in_mm = float(density[0]) * (1e-9 if model.units == "kPa" else 1e-12)  # kg, or t, in a mm3
+    ET.SubElement(solid, "DiagonalMass", massDensity=repr(in_mm), topology="@mesh")
+    ET.SubElement(
+        solid, "TetrahedronFEMForceField", template="Vec3", topology="@mesh", method="large",
+        youngModulus=listed(materials.young[materials.of_cell]), poissonRatio=listed(materials.nu[materials.of_cell]),
+    )  # fmt: skip
+    for load in model.loads:
+        if load.kind != "gravity":
+            kind, values = load_of(model, load)
+            ET.SubElement(solid, kind, name=f"{load.kind}_{load.set_name}", template="Vec3", **values)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode")
+
+
+# %%
+# From here on `.scn` is a suffix like any other in this process: `tetopt.save_model` writes it, whole or not at all,
+# and so do `tetopt.run` and the command (`from tetopt.cli import main`).
+
+tetopt.register_format(".scn", sofa, "SOFA scene", runs=True)
+
+image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+mesh = tetopt.mesh_image(image, nodes=300, iterations=3).mesh
+loads = ["hold:inferior", "pressure:superior:0.1"]
+model = tetopt.build_model(mesh, image, young="0.5+0.02*h", nu=0.3, loads=loads)
+with tempfile.TemporaryDirectory() as folder:
+    path = Path(folder) / "ball.scn"
+    tetopt.save_model(path, model)
+    solid = ET.parse(path).find("Node[@name='solid']")
+
+# %%
+# Read the file back with something that did not write it. Here the forces in the scene add up to the pressure, 0.1 kPa,
+# times the area of the side it acts on.
+
+forces = np.array(solid.find("ConstantForceField").get("forces").split(), dtype=float).reshape(-1, 3)
+total_mN = -forces.sum(axis=0)[2]
+print(f"force on the upper side: {total_mN:.1f} mN")
+
+# %%
+# The nodes that the scene holds, in red, and those that it pushes, in blue.
+
+held_nodes = np.array(solid.find("FixedProjectiveConstraint").get("indices").split(), dtype=int)
+pushed_nodes = np.array(solid.find("ConstantForceField").get("indices").split(), dtype=int)
+plotter = pyvista.Plotter(window_size=(700, 600))
+plotter.add_mesh(mesh.to_pyvista(), style="wireframe", color="#999999", line_width=1)
+plotter.add_points(mesh.points[held_nodes], color="#c03030", point_size=9, render_points_as_spheres=True)
+plotter.add_points(mesh.points[pushed_nodes], color="#2060c0", point_size=9, render_points_as_spheres=True)
+plotter.show()
