@@ -1,7 +1,12 @@
 """The public names of tetopt, and the modules that they are loaded from."""
 
 from .check import check_mesh as check_mesh
-from .contents.align import foreground_mask as foreground_mask, resample_contrast as resample_contrast, resample_labels as resample_labels, resample_mask as resample_mask
+from .contents.align import (
+    foreground_mask as foreground_mask,
+    resample_contrast as resample_contrast,
+    resample_labels as resample_labels,
+    resample_mask as resample_mask,
+)
 from .contents.content import Content as Content, content as content
 from .contents.statistics import Statistics as Statistics
 from .energy.discretization import E_D as E_D
@@ -12,7 +17,12 @@ from .engine.loop import IterationRecord as IterationRecord, MeshingResult as Me
 from .engine.meshing import mesh_image as mesh_image
 from .engine.paper import optimize_paper as optimize_paper
 from .errors import InputError as InputError
-from .fem.solution import Solution as Solution, SolutionFields as SolutionFields, solution_fields as solution_fields, solve as solve
+from .fem.solution import (
+    Solution as Solution,
+    SolutionFields as SolutionFields,
+    solution_fields as solution_fields,
+    solve as solve,
+)
 from .geometry.surface import Surface as Surface, extract_surface as extract_surface
 from .image import Image as Image, VoxelGrid as VoxelGrid
 from .io.formats import register_format as register_format, save_mesh as save_mesh, save_model as save_model
@@ -25,7 +35,13 @@ from .io.surfaces import save_surface as save_surface
 from .job.events import Event as Event
 from .job.job import Job as Job
 from .job.run import Result as Result, run as run
-from .measure.fidelity import LabelFidelity as LabelFidelity, MaskFidelity as MaskFidelity, cell_labels as cell_labels, label_fidelity as label_fidelity, mask_fidelity as mask_fidelity
+from .measure.fidelity import (
+    LabelFidelity as LabelFidelity,
+    MaskFidelity as MaskFidelity,
+    cell_labels as cell_labels,
+    label_fidelity as label_fidelity,
+    mask_fidelity as mask_fidelity,
+)
 from .measure.interfaces import LabelInterface as LabelInterface, label_interfaces as label_interfaces
 from .measure.quality import Quality as Quality, QualityErrors as QualityErrors, quality as quality
 from .measure.segmentation import segment as segment
