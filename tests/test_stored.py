@@ -6,7 +6,6 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.volumes import VoxelsInFile
-from tetopt.stored import StoredImage
 
 AFFINE = np.array([[0.0, -2.0, 0.5, 3.0], [1.0, 0.0, 0.0, -7.0], [0.0, 0.25, 3.0, 11.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -16,7 +15,7 @@ def ramp(*shape):
 
 
 def test_a_box_keeps_its_place():
-    stored, whole = StoredImage(ramp(5, 6, 7), AFFINE), Image(ramp(5, 6, 7), AFFINE)
+    stored, whole = Image.stored(ramp(5, 6, 7), AFFINE), Image(ramp(5, 6, 7), AFFINE)
     box = stored.box((1, 2, 3), (4, 4, 7))
     np.testing.assert_array_equal(box.data, whole.data[1:4, 2:4, 3:7])
     np.testing.assert_array_equal(box.to_world([0, 0, 0]), whole.to_world([1, 2, 3]))
@@ -27,13 +26,13 @@ def test_a_box_keeps_its_place():
 @pytest.mark.parametrize("shape", [(5, 6), (5, 6, 7, 2), (5, 0, 7)])
 def test_other_than_three_axes_are_refused(shape):
     with pytest.raises(InputError, match="expected three axes with a voxel at least"):
-        StoredImage(ramp(*shape))
+        Image.stored(ramp(*shape))
 
 
 def test_values_that_no_image_takes_are_seen_in_their_box():
     voxels = np.zeros((4, 4, 4))
     voxels[3, 0, 0] = np.nan
-    stored = StoredImage(voxels)
+    stored = Image.stored(voxels)
     stored.box((0, 0, 0), (3, 4, 4))
     with pytest.raises(InputError, match="NaN"):
         stored.box((2, 0, 0), (4, 4, 4))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tetopt.errors import InputError
     from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solve
     from tetopt.geometry.surface import Surface, extract_surface
-    from tetopt.image import Image, VoxelGrid
+    from tetopt.image import Image
     from tetopt.io.formats import save_mesh, save_model
     from tetopt.io.frd import Results, read_frd
     from tetopt.io.images import load_image, save_image
@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from tetopt.io.surfaces import save_surface
     from tetopt.job.events import Event
     from tetopt.job.job import Job
+    from tetopt.job.plan import Plan, plan
+    from tetopt.job.read import read
     from tetopt.job.run import Result, run
+    from tetopt.job.task import Meshed, Task
     from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
     from tetopt.measure.interfaces import LabelInterface, label_interfaces
     from tetopt.measure.quality import Quality, QualityErrors, quality
@@ -54,7 +57,6 @@ if TYPE_CHECKING:
     from tetopt.start.lattice import lattice_mesh
     from tetopt.start.octree import octree_mesh
     from tetopt.start.sizes import Sizes
-    from tetopt.stored import StoredImage
 
 _NAMES_OF = {  # by module
     "check": ("check_mesh",),
@@ -71,7 +73,7 @@ _NAMES_OF = {  # by module
     "errors": ("InputError",),
     "fem.solution": ("Solution", "SolutionFields", "solution_fields", "solve"),
     "geometry.surface": ("Surface", "extract_surface"),
-    "image": ("Image", "VoxelGrid"),
+    "image": ("Image",),
     "io.formats": ("save_mesh", "save_model"),
     "io.frd": ("Results", "read_frd"),
     "io.images": ("load_image", "save_image"),
@@ -81,7 +83,10 @@ _NAMES_OF = {  # by module
     "io.surfaces": ("save_surface",),
     "job.events": ("Event",),
     "job.job": ("Job",),
+    "job.plan": ("Plan", "plan"),
+    "job.read": ("read",),
     "job.run": ("Result", "run"),
+    "job.task": ("Meshed", "Task"),
     "measure.fidelity": ("LabelFidelity", "MaskFidelity", "cell_labels", "label_fidelity", "mask_fidelity"),
     "measure.interfaces": ("LabelInterface", "label_interfaces"),
     "measure.quality": ("Quality", "QualityErrors", "quality"),
@@ -100,7 +105,6 @@ _NAMES_OF = {  # by module
     "start.lattice": ("lattice_mesh",),
     "start.octree": ("octree_mesh",),
     "start.sizes": ("Sizes",),
-    "stored": ("StoredImage",),
 }
 __all__ = [
     "E_D",
@@ -123,9 +127,11 @@ __all__ = [
     "Materials",
     "Mesh",
     "MeshFile",
+    "Meshed",
     "MeshingResult",
     "Model",
     "Phantom",
+    "Plan",
     "Quality",
     "QualityErrors",
     "Result",
@@ -136,9 +142,8 @@ __all__ = [
     "Solution",
     "SolutionFields",
     "Statistics",
-    "StoredImage",
     "Surface",
-    "VoxelGrid",
+    "Task",
     "__version__",
     "build_model",
     "cell_fields",
@@ -162,7 +167,9 @@ __all__ = [
     "open_stored",
     "optimize",
     "optimize_paper",
+    "plan",
     "quality",
+    "read",
     "read_frd",
     "resample_contrast",
     "resample_labels",

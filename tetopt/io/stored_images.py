@@ -28,13 +28,12 @@ from tetopt.io.itk_headers import HEADED_SUFFIXES, raw_voxels
 from tetopt.io.read_itk import itk_place
 from tetopt.io.volumes import VoxelsInFile, check_room, volume_index
 from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
-from tetopt.stored import StoredImage
 
 STORED_SUFFIXES = (ZARR_SUFFIX, ".nii", *HEADED_SUFFIXES)
 _PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
 
 
-def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> StoredImage:
+def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> Image:
     """An image whose voxels are left where they are.
 
     Parameters
@@ -50,7 +49,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
 
     Returns
     -------
-    StoredImage
+    Image
         What it reads of a file is what `tetopt.load_image` has there, to the bit, and so is the affine. A box that
         cannot be read is an InputError that names the voxels.
 
@@ -151,7 +150,7 @@ def check_local(path: str | Path) -> None:
         raise InputError(f"{path}: is not on this machine; download it, only folders and files here are read")
 
 
-def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
     with os_errors_named():
         if is_zarr(path):
             return open_zarr(zarr_levels(path, notes)[0], volume)
@@ -167,10 +166,10 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
     raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
 
 
-def _cropped(image: StoredImage, ranges: list[tuple[int, int]]) -> StoredImage:
+def _cropped(image: Image, ranges: list[tuple[int, int]]) -> Image:
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return StoredImage(image.voxels.within(ranges), affine)
+    return Image.stored(image.voxels.within(ranges), affine)
 
 
 class _Scaled:
@@ -184,7 +183,7 @@ class _Scaled:
         return apply_read_scaling(np.array(self.mapped[picks]), self.slope, self.inter)
 
 
-def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> Image:
     proxy, index, affine = nibabel_voxels(path, volume, notes)
     if len(proxy.shape) < 3:
         raise InputError(f"expected a volume, got a plane of {proxy.shape} voxels")
@@ -194,10 +193,10 @@ def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredIma
     scaled = _Scaled(mapped, proxy.slope, proxy.inter)
     voxels = VoxelsInFile(path, scaled, (*(slice(0, size) for size in shape[:3]), *index))
     voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
-    return StoredImage(voxels, affine)
+    return Image.stored(voxels, affine)
 
 
-def _mapped_itk(path: Path, volume: int | None) -> StoredImage:
+def _mapped_itk(path: Path, volume: int | None) -> Image:
     raw = raw_voxels(path)
     sizes, affine = itk_place(path)
     if len(sizes) < 3:
@@ -207,4 +206,4 @@ def _mapped_itk(path: Path, volume: int | None) -> StoredImage:
     index = volume_index(sizes[3:], volume)
     with os_errors_named():
         array = np.memmap(raw.file, raw.dtype, "r", raw.offset, raw.sizes, order="F")
-    return StoredImage(VoxelsInFile(path, array, (*(slice(0, size) for size in sizes[:3]), *index)), affine)
+    return Image.stored(VoxelsInFile(path, array, (*(slice(0, size) for size in sizes[:3]), *index)), affine)
