@@ -96,9 +96,10 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
 
 
 def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = None) -> Image | None:
-    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, whole in memory, in its own place.
+    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, in its own place.
 
-    None of an image without such a level, and of files that have no levels.
+    Its voxels stay in the file until they are drawn, but are read once, so that what is wrong with them shows. None of
+    an image without such a level, and of files that have no levels.
 
     Raises
     ------
@@ -116,7 +117,8 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
         image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume)
         check_chunks(image.voxels, [])
         check_room(image.shape, image.voxels.dtype.itemsize)
-        return image.box((0, 0, 0), image.shape)
+        image.box((0, 0, 0), image.shape)
+        return image
     except InputError as error:
         raise named_error(path, error) from error
 

@@ -47,7 +47,12 @@ from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, identity, remov
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
-WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
+# Options that look at all cells or voxels at once, and the values of them that parts take besides none at all.
+PARTS_TAKE: dict[str, Any] = {
+    "mask": None, "background": None, "labels": None, "slice_": None, "target_error": None, "size_max": None,
+    "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
+}  # fmt: skip
+LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # likewise, if the image is left in its file
 
 
 def with_parts(plan: Plan) -> Plan:
@@ -110,13 +115,15 @@ def _strange_option(plan: Plan) -> str | None:
         return "`parts`: of a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
     if len(job.images) > 1:
         return f"`parts`: expected one IMAGE, got {len(job.images)}; leave the others out, or `parts`"
-    whole = {
-        "mask": job.mask, "background": job.background, "labels": job.labels, "slice_": job.slice_,
-        "target_error": job.target_error, "size_max": job.size_max, "sizing": job.sizing,
-        "max_gb": job.max_gb, "order": job.order if job.order == 2 else None,
-        "boundary": "fixed" if job.boundary == "fixed" else None,
-    }  # fmt: skip
-    return next((f"`{name}`: {WHOLE_ONLY}" for name, value in whole.items() if value is not None), None)
+    return _whole_only(plan, PARTS_TAKE)
+
+
+def _whole_only(plan: Plan, taken: dict[str, Any]) -> str | None:
+    """The first of the options that has another value than none and the one that is taken, in words."""
+    for name, value in taken.items():
+        if getattr(plan.job, name) not in (None, value):
+            return f"`{name}`: looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
+    return None
 
 
 def _is_left(plan: Plan) -> bool:
@@ -132,8 +139,8 @@ def left_source(plan: Plan) -> Source | None:
     if plan.left is None:
         return None
     path = plan.left.path
-    if plan.job.average not in (None, DEFAULT_AVERAGE):
-        raise InputError(f"`average`: {WHOLE_ONLY}")
+    if (strange := _whole_only(plan, LEFT_TAKE)) is not None:
+        raise InputError(strange)
     if plan.job.young is not None:
         note("`young`: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
     level = coarse_image(path, MOST_DRAWN) if plan.pictures and plan.job.crop is None else None
