@@ -244,11 +244,6 @@ class Image:
         affine[:-1, -1] = self.to_world(start)
         return Image(self.read(start, stop), affine)
 
-    def check_in_memory(self, what: str, remedy: str) -> None:
-        """InputError unless the voxels are in memory: `what` needs them there; `remedy` says what does not."""
-        if self.is_stored:
-            raise InputError(f"{what} of an image in memory, and this one is stored; {remedy}")
-
     @property
     def box_bytes(self) -> float:
         """Memory that `boxes` take while they are gone over."""
@@ -259,6 +254,17 @@ class Image:
 
         Those of voxels in memory are small; others are as thick as chunks, and of `READ_BYTES` at most, but that a
         single row is read whole, whatever it takes.
+
+        Returns
+        -------
+        iterator of three slices
+            Along the axes; a plane is the first one of a volume.
+
+        Examples
+        --------
+        >>> stored = tetopt.Image.stored(np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64)))
+        >>> list(stored.boxes())
+        [(slice(0, 64, None), slice(0, 64, None), slice(0, 64, None))]
         """
         s0, s1, s2 = shape = (1,) * (3 - self.ndim) + self.shape
         if not self.is_stored:
@@ -328,6 +334,12 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
     check_intensities(float(values.min()), float(values.max()))
     values.setflags(write=False)
     return values
+
+
+def check_in_memory(image: Image, what: str, remedy: str) -> None:
+    """InputError unless the voxels are in memory: `what` needs them there; `remedy` says what does not."""
+    if image.is_stored:
+        raise InputError(f"{what} of an image in memory, and this one is stored; {remedy}")
 
 
 def check_kind(dtype: np.dtype) -> None:

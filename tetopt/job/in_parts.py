@@ -244,7 +244,7 @@ def _check_room(need: Need, room: float) -> None:
 def _request(task: Task) -> PartsRequest:
     """What is asked for, with a checksum of all on which the mesh depends."""
     plan, sizes = task.plan, task.sizes
-    engine, nodes = plan.engine_options(), task.size.n_nodes
+    engine, nodes = plan.engine_options, task.size.n_nodes
     values: dict[str, Any] = {
         "nodes": nodes, "n_parts": plan.division.checked_number(nodes), "k_D": engine["k_D"],
         "iterations": engine["iterations"], "shape_power": engine["shape_power"],

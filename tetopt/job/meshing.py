@@ -32,6 +32,7 @@ from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early
 from tetopt.job.options import SolverOptions, has_model
+from tetopt.job.plan import kind_of
 from tetopt.job.predict import stated_prediction
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
@@ -55,7 +56,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
 
 def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
     """In this process, all iterations in one round; towards an error, or of order 2, several runs in turn."""
-    job, content, options = task.plan.job, task.source.content, task.plan.engine_options()
+    job, content, options = task.plan.job, task.source.content, task.plan.engine_options
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
@@ -77,7 +78,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
             started("start", START_WORDS)
         return result
 
-    kind = task.plan.kind(content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
+    kind = kind_of(task.plan, content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
     started("start", START_WORDS)
     result = mesh_image(
         content, job.nodes, target_error=job.target_error, mode=task.plan.mode,

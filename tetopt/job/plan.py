@@ -61,14 +61,7 @@ class Plan(NamedTuple):
     left: VolumeFile | None = None
     pictures: Sequence[Path] = ()
 
-    def kind(self, ndim: int) -> str:
-        """What the initial mesh is: a kind of lattice, octree or start."""
-        if self.mode == "start":
-            return "start"
-        if self.mode == "graded":
-            return "octree"
-        return self.job.lattice or KINDS[ndim][0]
-
+    @property
     def engine_options(self) -> dict[str, Any]:
         """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
         job = self.job
@@ -77,28 +70,53 @@ class Plan(NamedTuple):
             return options | {"n_t": job.n_t, "retessellate": job.retessellate}
         return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
 
-    def stated(self, ndim: int) -> dict[str, Any]:
-        """The options as the mesh's file and run.json state them; files by their names."""
-        job = self.job
-        return {
-            "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
-            "lattice": self.kind(ndim), "size_min": job.size_min, "size_max": job.size_max,
-            "edge_max": job.edge_max, "gradation": job.gradation,
-            "sizing": None if job.sizing is None else job.sizing.name,
-            **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
-            "start": None if job.start is None else job.start.name, **self.engine_options(),
-            **self.division.stated,
-        }  # fmt: skip
-
-    def with_job(self, **changes: Any) -> Plan:
-        """The same of other options."""
-        return self._replace(job=changed(self.job, **changes))
-
     def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
-        """The same of other images and other files, as many and of the same options."""
+        """The same of other images and other files, as many and of the same options.
+
+        Parameters
+        ----------
+        images : sequence of Path
+            Contrasts.
+        files : mapping of str to Path
+            The others, by the names of their options.
+
+        Returns
+        -------
+        Plan
+            Nothing is checked again.
+
+        Examples
+        --------
+        >>> plan = tetopt.plan(tetopt.Job(images="brain.nii.gz", output="brain.vtu"))
+        >>> [path.name for path in plan.with_files([Path("other.nii.gz")], {}).job.images]
+        ['other.nii.gz']
+        """
         return self._replace(
             job=changed(self.job, images=list(images), **files), bare=changed(self.bare, images=list(images), **files)
         )
+
+
+def kind_of(plan: Plan, ndim: int) -> str:
+    """What the initial mesh is: a kind of lattice, octree or start."""
+    if plan.mode == "start":
+        return "start"
+    if plan.mode == "graded":
+        return "octree"
+    return plan.job.lattice or KINDS[ndim][0]
+
+
+def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
+    """The options as the mesh's file and run.json state them; files by their names."""
+    job = plan.job
+    return {
+        "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
+        "lattice": kind_of(plan, ndim), "size_min": job.size_min, "size_max": job.size_max,
+        "edge_max": job.edge_max, "gradation": job.gradation,
+        "sizing": None if job.sizing is None else job.sizing.name,
+        **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
+        "start": None if job.start is None else job.start.name, **plan.engine_options,
+        **plan.division.stated,
+    }  # fmt: skip
 
 
 def plan(job: JobOptions) -> Plan:
@@ -278,7 +296,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
         return plan, None
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
-        return plan.with_job(nodes=nodes), None
+        return plan._replace(job=changed(job, nodes=nodes)), None
     order, nodes, limits = job.order or 1, job.nodes, _limits(job)
     if not is_counted:
         nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
@@ -287,7 +305,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
     if longest is None and nodes is not None:
         longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
         longest = longest if longest < np.inf else None
-    return plan.with_job(nodes=nodes, edge_max=longest), limits
+    return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits
 
 
 def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:

@@ -67,7 +67,7 @@ def _read(plan: Plan) -> Task:
         begun = read_mesh(plan.job.start)
         _check_place(begun.mesh, source.contrasts[0], str(plan.job.start))
         if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
-            plan = plan.with_job(order=2)
+            plan = plan._replace(job=changed(plan.job, order=2))
         if source.labels is not None and not source.table.names:
             source = source.with_table(label_table(None, begun))
     plan, sizes = with_numbers(plan, source.content)

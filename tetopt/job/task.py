@@ -40,7 +40,7 @@ class Task(NamedTuple):
     Examples
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    >>> task = tetopt.read(tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60))
+    >>> task = tetopt.read(tetopt.Job(images="small.nii.gz", output="other.vtu", nodes=60))
     >>> task.plan.mode, task.source.content.image.shape, task.size.n_nodes
     ('graded', (8, 8, 8), 60)
     """

@@ -27,6 +27,7 @@ from tetopt.job.model import (
     with_chosen_sets,
 )
 from tetopt.job.options import SolverOptions
+from tetopt.job.plan import stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
@@ -70,7 +71,7 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
     that could not be is left out, and noted in `failed`.
     """
     plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
-    options = plan.stated(source.content.image.ndim)
+    options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}

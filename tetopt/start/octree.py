@@ -27,7 +27,7 @@ from tetopt.budget import check_memory
 from tetopt.contents.content import Content, plain
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.image import Image
+from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
 from tetopt.start.delaunay import delaunay, without_flat
@@ -167,9 +167,10 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
     target = None
     if sizes.has_target:
-        image.check_in_memory(
-            "sizes: largest and field are for each voxel", "use smallest, longest, coarsest and gradation, or crop it"
-        )
+        check_in_memory(
+            image, "sizes: largest and field are for each voxel",
+            "use smallest, longest, coarsest and gradation, or crop it",
+        )  # fmt: skip
         target = _target(image, sizes)
     return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
