@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from tetopt import InputError, load_phantom
+from tetopt import Image, InputError, load_phantom
 from tetopt.budget import peak_bytes
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.tasks import Done, run_tasks
@@ -33,7 +33,6 @@ from tetopt.io.zarr_images import save_zarr
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import PartsRequest, Round, Runner, mesh_in_parts
 from tetopt.parts.work import VolumeFile, save_volume
-from tetopt.stored import StoredImage
 
 BOX_MM = 204.8
 N_BALLS = 400
@@ -106,7 +105,7 @@ def paint(volume: Path, edge: int) -> None:
     table = volume.with_suffix(".toml")
     table.write_text(balls(edge), encoding="utf-8")
     voxels = load_phantom(table).voxels()
-    save_zarr(volume, StoredImage(voxels, voxels.affine), voxels, np.int16)
+    save_zarr(volume, Image.stored(voxels, voxels.affine), voxels, np.int16)
 
 
 def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes: float) -> dict[str, Any]:

@@ -348,7 +348,7 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 
 
 def test_what_is_violated_is_told_in_the_commands_options(capsys):
-    result = MeshingResult(None, [], "iterations")
+    result = MeshingResult(None, [], "iterations", None)
     missed = {"floor": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`", "box": "k_D.nii lies beyond"}
     with listened(show_event):
         assert tell_violated(result, {}) == []

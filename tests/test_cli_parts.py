@@ -92,7 +92,7 @@ def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypa
     with pytest.raises(ZeroDivisionError):
         exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300)
     assert "in one piece it would take" in capfd.readouterr().err
-    assert chosen[0][0].n_parts == 1  # as run.json's request has it
+    assert chosen[0][0].plan.division.n_parts == 1  # as run.json's request has it
     # What parts do not do is tried in one piece, as ever: the bound on its memory is a rough one.
     assert exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--order", 2) == 0
 

@@ -249,3 +249,23 @@ def test_only_the_command_prints():
         or (isinstance(node, ast.Attribute) and node.attr in streams and getattr(node.value, "id", "") == "sys")
     ]
     assert printed == []
+
+
+# What forks on voxels that are only stored, or on parts; `Division.chosen` and the methods of `Image` stand for it.
+FORK = re.compile(
+    r"\.is_stored\b|\bStored(Image|Content|Source)\b|\bn_parts (is|==|!=|<|>)|\bisinstance\([^)]*\bSource\b"
+)
+
+
+def test_only_parts_and_images_know_of_parts_and_stored_voxels():
+    """One image, one source and one run: what differs is within `parts/` and the class of images."""
+    knowing = {ROOT / "tetopt" / "image.py", *(ROOT / "tetopt" / "parts").glob("*.py")}
+    forks = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for path in SOURCES
+        if path not in knowing
+        for number, line in enumerate(text_of(path).splitlines(), 1)
+        if FORK.search(line)
+    ]
+    assert forks == []
+    assert any(FORK.search(text_of(path)) for path in knowing)

@@ -29,7 +29,7 @@ from tetopt.fem.reference import reference
 from tetopt.job.events import listened, started
 from tetopt.job.meshing import prepare, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
-from tetopt.start.sums import channels_of, source_of
+from tetopt.start.sums import channels_of
 
 GIB = 1 << 30
 
@@ -100,11 +100,11 @@ def test_a_limit_counts_what_there_is(monkeypatch):
 
 IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0]))
 LATTICE = tetopt.lattice_mesh(IMAGE, blocks=(2, 2, 2))
-LIMITS = _block_limits(source_of(IMAGE), 100, None)
+LIMITS, CHANNELS = _block_limits(plain(IMAGE), 100, None), channels_of(plain(IMAGE))
 TASKS = {
     "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
-        source_of(IMAGE), channels_of(source_of(IMAGE)), (4, 4, 4), LIMITS
+        plain(IMAGE), CHANNELS, (4, 4, 4), LIMITS
     ),
     "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
     "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
@@ -216,7 +216,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
             clock[0] = float(second)
             assert not stop()
         callback(rows[1])
-        return MeshingResult(LATTICE, rows, "iterations")
+        return MeshingResult(LATTICE, rows, "iterations", LATTICE)
 
     with cli_run.Display(lambda: None) as display, listened(display):
         started("kernels")

@@ -165,7 +165,7 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     assert np.ptp(mesh.plot(mesh.points[:, 0], off_screen=True, cmap="gray", show_edges=False)) > 0
     assert np.ptp(sample_model(2).mesh.plot(off_screen=True)) > 0
     result = MeshingResult(
-        mesh, [], "iterations", labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int)
+        mesh, [], "iterations", mesh, labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int)
     )
     shown = result.plot(off_screen=True, show_edges=False, lighting=False).reshape(-1, 3)
     for colour in label_colours(tetopt.Image(result.labels[None]))[np.unique(result.labels)]:  # as in other pictures

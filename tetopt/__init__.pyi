@@ -24,7 +24,7 @@ from .fem.solution import (
     solve as solve,
 )
 from .geometry.surface import Surface as Surface, extract_surface as extract_surface
-from .image import Image as Image, VoxelGrid as VoxelGrid
+from .image import Image as Image
 from .io.formats import register_format as register_format, save_mesh as save_mesh, save_model as save_model
 from .io.frd import Results as Results, read_frd as read_frd
 from .io.images import load_image as load_image, save_image as save_image
@@ -34,7 +34,10 @@ from .io.stored_images import open_stored as open_stored
 from .io.surfaces import save_surface as save_surface
 from .job.events import Event as Event
 from .job.job import Job as Job
+from .job.plan import Plan as Plan, plan as plan
+from .job.read import read as read
 from .job.run import Result as Result, run as run
+from .job.task import Meshed as Meshed, Task as Task
 from .measure.fidelity import (
     LabelFidelity as LabelFidelity,
     MaskFidelity as MaskFidelity,
@@ -59,6 +62,5 @@ from .phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_ph
 from .start.lattice import lattice_mesh as lattice_mesh
 from .start.octree import octree_mesh as octree_mesh
 from .start.sizes import Sizes as Sizes
-from .stored import StoredImage as StoredImage
 
 __version__: str

@@ -10,7 +10,7 @@ from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 
@@ -216,7 +216,7 @@ def filled_share(mesh: Mesh, image: Image) -> float:
     return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
 
-def beyond_box(mesh: Mesh, image: VoxelGrid) -> NDArray[np.float64]:
+def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:
     """How far each node lies beyond the image's box, voxels along an index axis, (N,); below 0 inside."""
     low, high = box_sides(image.shape).T
     index = image.to_index(mesh.points)

@@ -1,15 +1,19 @@
-"""The image: a scalar field on voxels with its place in the world."""
+"""The image: a scalar field on voxels with its place in the world, in memory or stored."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt import notebook
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 
 SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
@@ -20,27 +24,111 @@ LENGTH_RANGE = (1e-9, 1e9)  # mm, of a voxel's edge: their fifth powers, E_G, ar
 MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates have no ten millionth of a voxel left
 # Of intensities, and of their range: squares, summed over 2^31 voxels, stay within doubles that have all their digits.
 INTENSITY_RANGE = (1e-152, 1e148)
+READ_BYTES = 2**28  # of a stored volume at a time, at most: 128 planes of 1024^2 voxels of 16 bits
+PIECE_VOXELS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
+LOADED_BYTES = 16.0  # of a voxel, while all are read: as they are stored, and as floats of either size
+
+Box = tuple[slice, slice, slice]
 
 
-class VoxelGrid:
-    """Where voxels lie in the world: what an `Image` shares with images that are read in parts.
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Scalar intensities h on a grid of voxels, in two or three dimensions.
 
     Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
-    ``shape - 0.5`` along every axis.
+    ``shape - 0.5`` along every axis. The affine takes indices to world millimetres, RAS+ in 3-D; it may flip,
+    rotate, shear and scale each axis differently. The voxels are in memory, or stay where they are stored
+    (`Image.stored`, `tetopt.open_stored`), and are read box by box.
+
+    Parameters
+    ----------
+    data : (s_0, ..., s_{n-1}) array of real numbers
+        Intensities, n = 2 or 3. Kept as float32 where that loses nothing, else as float64; read-only.
+    affine : (n+1, n+1) array, optional
+        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Kept as float64; read-only.
+
+    Raises
+    ------
+    InputError
+        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or
+        of another size.
+
+    See Also
+    --------
+    load_image : Read one from a file.
+    open_stored : Leave its voxels in the file.
 
     Examples
     --------
-    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> image.ndim, image.spacing.tolist(), round(image.volume)
-    (3, [4.0, 4.0, 4.0], 262144)
+    >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+    >>> image.ndim, image.spacing.tolist(), round(image.voxel_volume, 6)
+    (3, [2.0, 2.0, 3.0], 12.0)
     """
 
+    voxels: Any  # `data`, or whatever gives boxes of what is stored
     affine: NDArray[np.float64]
+
+    def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
+        checked = _checked_data(data)
+        affine = checked_affine(np.eye(checked.ndim + 1) if affine is None else affine, checked.ndim)
+        vars(self).update(voxels=checked, affine=affine, data=checked)
+
+    @classmethod
+    def stored(cls, voxels: Any, affine: ArrayLike | None = None) -> Image:
+        """An image in three dimensions whose voxels stay where they are, and need not fit into memory.
+
+        Parameters
+        ----------
+        voxels : array of three axes
+            Whatever has a `shape` and a `dtype` and gives an array of numbers for a tuple of slices: an array of zarr,
+            dask or h5py, or a mapped one of numpy. What values they have is looked at as they are read.
+        affine : (4, 4) array, optional
+            As of every image.
+
+        Returns
+        -------
+        Image
+            Of which nothing is read.
+
+        Raises
+        ------
+        InputError
+            Other than three axes, an empty axis, or an affine that no image takes.
+
+        Examples
+        --------
+        >>> voxels = np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64))
+        >>> stored = tetopt.Image.stored(voxels, np.diag([0.5, 0.5, 0.5, 1.0]))
+        >>> stored.shape, stored.box((0, 0, 0), (8, 8, 8)).shape
+        ((64, 64, 64), (8, 8, 8))
+        """
+        shape = tuple(int(size) for size in voxels.shape)
+        if len(shape) != 3 or 0 in shape:
+            raise InputError(f"image: expected three axes with a voxel at least, got shape {shape}")
+        image = cls.__new__(cls)
+        vars(image).update(voxels=voxels, affine=checked_affine(np.eye(4) if affine is None else affine, 3))
+        return image
+
+    @cached_property
+    def data(self) -> NDArray[np.floating]:
+        """All intensities, as of `Image(data)`; those of a stored image are read when first asked for, and kept."""
+        check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read boxes of it")
+        return _checked_data(self.read((0,) * self.ndim, self.shape))
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether the voxels are where they are stored, and have not been read as a whole."""
+        return "data" not in vars(self)
+
+    @property
+    def in_memory(self) -> Image | None:
+        """The image itself, unless its voxels are only stored."""
+        return None if self.is_stored else self
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
-        raise NotImplementedError
+        return tuple(int(size) for size in self.voxels.shape)
 
     @property
     def ndim(self) -> int:
@@ -106,55 +194,100 @@ class VoxelGrid:
         shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
         return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
 
+    def read(self, start: Sequence[int], stop: Sequence[int]) -> NDArray:
+        """The voxels of a box of indices, in memory, of the type that is stored.
 
-@dataclass(frozen=True, eq=False)
-class Image(VoxelGrid):
-    """Scalar intensities h on a grid of voxels, in two or three dimensions.
+        Parameters
+        ----------
+        start, stop : (n,) sequences of int
+            The first index of the box along each axis, and the one after its last.
 
-    Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
-    ``shape - 0.5`` along every axis. The affine takes indices to world millimetres, RAS+ in 3-D; it may flip,
-    rotate, shear and scale each axis differently.
+        Returns
+        -------
+        (stop - start) array
+            Of what is in memory a view.
 
-    Parameters
-    ----------
-    data : (s_0, ..., s_{n-1}) array of real numbers
-        Intensities, n = 2 or 3. Kept as float32 where that loses nothing, else as float64; read-only.
-    affine : (n+1, n+1) array, optional
-        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Kept as float64; read-only.
+        Examples
+        --------
+        >>> stored = tetopt.Image.stored(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
+        >>> stored.read((0, 0, 0), (1, 2, 4)).tolist()
+        [[[0, 1, 2, 3], [4, 5, 6, 7]]]
+        """
+        return np.asarray(self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
 
-    Raises
-    ------
-    InputError
-        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or
-        of another size.
+    def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
+        """The voxels of a box of indices as an image in memory; every voxel keeps its place in the world.
 
-    See Also
-    --------
-    load_image : Read one from a file.
+        Parameters
+        ----------
+        start, stop : (n,) sequences of int
+            The first index of the box along each axis, and the one after its last.
 
-    Examples
-    --------
-    >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
-    >>> image.ndim, image.spacing.tolist(), round(image.voxel_volume, 6)
-    (3, [2.0, 2.0, 3.0], 12.0)
-    """
+        Returns
+        -------
+        Image
+            The box.
 
-    data: NDArray[np.floating]
-    affine: NDArray[np.float64]
+        Raises
+        ------
+        InputError
+            Values that no `Image` takes, NaN among them.
 
-    def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
-        data = _checked_data(data)
-        affine = checked_affine(np.eye(data.ndim + 1) if affine is None else affine, data.ndim)
-        object.__setattr__(self, "data", data)
-        object.__setattr__(self, "affine", affine)
+        Examples
+        --------
+        >>> stored = tetopt.Image.stored(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
+        >>> corner = stored.box((2, 2, 2), (4, 4, 4))
+        >>> corner.to_world([0, 0, 0]).tolist() == stored.to_world([2, 2, 2]).tolist()
+        True
+        """
+        affine = self.affine.copy()
+        affine[:-1, -1] = self.to_world(start)
+        return Image(self.read(start, stop), affine)
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of voxels along each axis."""
-        return self.data.shape
+    def box_bytes(self) -> float:
+        """Memory that `boxes` take while they are gone over."""
+        return 2.0 * READ_BYTES if self.is_stored else 0.0
+
+    def boxes(self) -> Iterator[Box]:
+        """Boxes of whole rows that the voxels are gone over in, plane after plane; a plane is one of a volume.
+
+        Those of voxels in memory are small; others are as thick as chunks, and of `READ_BYTES` at most, but that a
+        single row is read whole, whatever it takes.
+
+        Returns
+        -------
+        iterator of three slices
+            Along the axes; a plane is the first one of a volume.
+
+        Examples
+        --------
+        >>> stored = tetopt.Image.stored(np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64)))
+        >>> list(stored.boxes())
+        [(slice(0, 64, None), slice(0, 64, None), slice(0, 64, None))]
+        """
+        s0, s1, s2 = shape = (1,) * (3 - self.ndim) + self.shape
+        if not self.is_stored:
+            return _boxes(shape, max(PIECE_VOXELS // (s1 * s2), 1), s1)
+        chunks, most_rows = (
+            getattr(self.voxels, "chunks", None),
+            READ_BYTES // (s2 * np.dtype(self.voxels.dtype).itemsize),
+        )
+        most_rows = max(most_rows, 1)
+        if chunks:
+            # Those of dask are all told, along each axis.
+            n_planes, step = (min(int(np.max(sizes)), s) for sizes, s in zip(chunks[:2], (s0, s1), strict=True))
+        elif _is_first_axis_fastest(self.voxels):
+            n_planes, step = s0, 1
+        else:
+            n_planes, step = max(min(s0, most_rows // s1), 1), 1
+        n_planes = min(n_planes, most_rows)
+        n_rows = most_rows // n_planes
+        return _boxes(shape, n_planes, min(n_rows // step * step or n_rows, s1))
 
     def __repr__(self) -> str:
-        return f"Image({self._size()}, {self.data.dtype}, {self.data.min():.4g} to {self.data.max():.4g})"
+        values = "stored" if self.is_stored else f"{self.data.min():.4g} to {self.data.max():.4g}"
+        return f"Image({self._size()}, {self.voxels.dtype}, {values})"
 
     def _size(self) -> str:
         """Number and size of voxels."""
@@ -162,10 +295,12 @@ class Image(VoxelGrid):
         return f"{counts} voxels of {sides} mm"
 
     def _repr_html_(self) -> str:
-        """Numbers and the middle slice, for a notebook."""
+        """Numbers and the middle slice, for a notebook; of a stored image neither intensities nor a picture."""
+        rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
+        if self.is_stored:
+            return notebook.card_html("Image", rows, "")
         low, high, mean = self.data.min(), self.data.max(), self.data.mean(dtype=np.float64)
-        rows = [("size", self._size()), ("intensities", f"{low:.4g} to {high:.4g}, mean {mean:.4g}")]
-        rows += [("kind", str(self.data.dtype))]
+        rows.insert(1, ("intensities", f"{low:.4g} to {high:.4g}, mean {mean:.4g}"))
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
@@ -199,6 +334,12 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
     check_intensities(float(values.min()), float(values.max()))
     values.setflags(write=False)
     return values
+
+
+def check_in_memory(image: Image, what: str, remedy: str) -> None:
+    """InputError unless the voxels are in memory: `what` needs them there; `remedy` says what does not."""
+    if image.is_stored:
+        raise InputError(f"{what} of an image in memory, and this one is stored; {remedy}")
 
 
 def check_kind(dtype: np.dtype) -> None:
@@ -285,3 +426,22 @@ def _check_extents(columns: NDArray[np.float64], lengths: NDArray[np.float64], o
             f"affine: expected the first voxel within {MOST_OFFSET:g} voxels of the world's origin, got "
             f"{origin.tolist()} mm; mend the file's header"
         )
+
+
+def _is_first_axis_fastest(voxels: Any) -> bool:
+    """Whether a mapped array lies in a file as NIfTI has it, so that planes along the first axis are all over it."""
+    strides = getattr(voxels, "strides", None)
+    return strides is not None and abs(strides[0]) < abs(strides[-1])
+
+
+def _boxes(shape: Sequence[int], n_planes: int, n_rows: int) -> Iterator[Box]:
+    """Boxes of so many planes and rows, and of all columns."""
+    for i in range(0, shape[0], n_planes):
+        for j in range(0, shape[1], n_rows):
+            yield slice(i, min(i + n_planes, shape[0])), slice(j, min(j + n_rows, shape[1])), slice(0, shape[2])
+
+
+def pieces(shape: Sequence[int]) -> Iterator[Box]:
+    """Boxes of whole rows that a box of voxels (P, R, K) is computed in: plane by plane, and rows in their order."""
+    n_rows = min(shape[1], max(PIECE_VOXELS // shape[2], 1))
+    return _boxes(shape, max(PIECE_VOXELS // (n_rows * shape[2]), 1), n_rows)

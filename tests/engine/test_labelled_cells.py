@@ -47,7 +47,7 @@ def labelled_state():
         mesh = tetopt.octree_mesh(target, nodes)
         grid = channel_grid(target, mesh.points)
         state = with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
-        return with_labels(state, target, mesh), target, grid
+        return with_labels(state, target, target.smooth, mesh), target, grid
 
     return made
 
@@ -157,7 +157,7 @@ def test_squares_count_voxels_of_other_labels(labelled_state):
     mesh, _, _ = parts(state, target, grid)
     owner = tetopt.energy.sampling.cell_of_voxel(target.image, mesh).ravel()
     own, there = state.complex.labels[owner], target.memberships.partition.ravel()
-    value = target.own_value.astype(float) ** 2
+    value = target.smooth.own_value.astype(float) ** 2
     cost = np.where(own != there, value[own] + value[there], 0.0)
     np.testing.assert_allclose(cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6)
     assert cost.sum() > 0.0
@@ -169,7 +169,7 @@ def test_interface_energy_is_the_area_between_labels(labelled_state):
     shared, labels, value = (
         tetopt.geometry.topology.facets(mesh.cells),
         state.complex.labels,
-        target.own_value.astype(float) ** 2,
+        target.smooth.own_value.astype(float) ** 2,
     )
     inner = shared.cells[(shared.cells >= 0).all(axis=1)]
     total = 0.0
@@ -298,7 +298,9 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
     target = content(image, labels=image, weights=[0.0])
     mesh = tetopt.octree_mesh(target, 300)
     grid = channel_grid(target, mesh.points)
-    state = with_labels(with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, mesh)
+    state = with_labels(
+        with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, target.smooth, mesh
+    )
     before = None
     for move in ("attract", "sweep", "flip", "exchange"):
         before = topology(state, target, grid)

@@ -21,7 +21,6 @@ from tetopt.io.images import file_shape, load_image, save_image, sha256
 from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
 from tetopt.io.zarr_images import save_zarr
 from tetopt.phantom import load_phantom
-from tetopt.stored import StoredImage
 
 zarr = pytest.importorskip("zarr")
 numcodecs = pytest.importorskip("numcodecs")
@@ -139,7 +138,7 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_images, "CHUNK_EDGE", 16)
     phantom, options = load_phantom("layered_oblique"), {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0}
     voxels, path = phantom.voxels(**options), tmp_path / "a.zarr"
-    low, high = save_zarr(path, StoredImage(voxels, voxels.affine), voxels, np.int16)
+    low, high = save_zarr(path, Image.stored(voxels, voxels.affine), voxels, np.int16)
     image, whole = open_stored(path), phantom.image(**options)
     stored = image.read((0, 0, 0), image.shape)
     np.testing.assert_array_equal(stored, np.rint(whole.data))

@@ -16,7 +16,7 @@ from tetopt.engine import cost
 from tetopt.engine.cost import RunSize
 from tetopt.interpreter import python_command, python_environment
 from tetopt.job import predict
-from tetopt.job.plan import planned
+from tetopt.job.plan import plan
 
 
 @pytest.fixture
@@ -29,13 +29,13 @@ def image_path(tmp_path):
 def sizes(monkeypatch):
     """The sizes of each prediction, in place of what is printed."""
     rows = []
-    monkeypatch.setattr(cli_mesh, "print_prediction", lambda plan, size: rows.append(size))
+    monkeypatch.setattr(cli_mesh, "print_prediction", lambda task: rows.append(task.size))
     return rows
 
 
 def plan_of(folder, images, **options):
     """A plan of options; nothing is read."""
-    return planned(Job(images=images, output=folder / "a.vtu", **options))
+    return plan(Job(images=images, output=folder / "a.vtu", **options))
 
 
 def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):

@@ -664,7 +664,9 @@ def test_a_constant_image_says_so(monkeypatch, tmp_path):
     initial = lattice_mesh(image, blocks=(2, 2))
     saved = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
-    save_run_figures([tmp_path / k for k in "abc"], image, initial, MeshingResult(initial, history(0.0), "iterations"))
+    save_run_figures(
+        [tmp_path / k for k in "abc"], image, initial, MeshingResult(initial, history(0.0), "iterations", initial)
+    )
     assert saved[0].axes[1].get_title() == "optimised, constant image"
 
 

@@ -108,7 +108,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
     known = share_in_wave()
-    monkeypatch.setattr(sys.modules["tetopt.start.sums"], "sampled_noise", lambda sample, inside: 0.0)
+    monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "sampled_noise", lambda sample: 0.0)
     assert known > 0.75
     assert share_in_wave() < 0.7
 

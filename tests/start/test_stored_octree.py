@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.contents.content import content, plain
-from tetopt.contents.statistics import stored_boxes, stored_statistics
+from tetopt.contents.content import Content, content, plain
+from tetopt.contents.statistics import statistics
 from tetopt.start.octree import nearest_octree, octree_mesh
-from tetopt.start.sums import _add_rows, block_sums, channels_of, source_of
-from tetopt.stored import StoredImage
+from tetopt.start.sums import _add_rows, block_sums, channels_of
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 THICK = np.diag([0.7, 0.8, 2.5, 1.0])
@@ -55,24 +54,23 @@ def assert_same(mesh, expected):
 def test_octree_is_that_of_voxels_in_memory(shape, dtype, affine, chunks, most, monkeypatch):
     image = tetopt.Image(noisy(shape, dtype), affine)
     expected = octree_mesh(image, 700)
-    statistics = sys.modules["tetopt.contents.statistics"]
-    monkeypatch.setattr(statistics, "READ_BYTES", most[0])
-    monkeypatch.setattr(statistics, "PIECE_VOXELS", most[1])
+    monkeypatch.setattr("tetopt.image.READ_BYTES", most[0])
+    monkeypatch.setattr("tetopt.image.PIECE_VOXELS", most[1])
     voxels = Recorded(noisy(shape, dtype), chunks)
-    stored = StoredImage(voxels, affine)
+    stored = tetopt.Image.stored(voxels, affine)
     assert_same(octree_mesh(stored, 700), expected)
     assert_same(octree_mesh(image, 700), expected)
     assert max(voxels.reads) <= most[0]
     n_reads = len(voxels.reads)
-    assert_same(octree_mesh(stored, 700, statistics=stored_statistics(stored)), expected)
+    assert_same(octree_mesh(Content(stored, statistics=statistics(stored)), 700), expected)
     assert len(voxels.reads) == 2 * n_reads  # its own statistics, which are the octree's
 
 
 def test_layouts_are_the_same():
     """As NIfTI has it in its files, the first axis fastest: read by rows of all planes."""
     data = noisy((20, 24, 22), np.float32)
-    stored = StoredImage(np.asfortranarray(data), OBLIQUE)
-    boxes = list(stored_boxes(stored))
+    stored = tetopt.Image.stored(np.asfortranarray(data), OBLIQUE)
+    boxes = list(stored.boxes())
     assert [box[0] for box in boxes] == [slice(0, 20)] * len(boxes)
     assert_same(octree_mesh(stored, 300), octree_mesh(tetopt.Image(data, OBLIQUE), 300))
 
@@ -92,7 +90,7 @@ def test_boxes_are_of_whole_chunks_within_what_may_be_read(shape, itemsize, chun
         dtype = np.dtype(f"u{itemsize}")
 
     Voxels.shape, Voxels.chunks = shape, chunks
-    boxes = list(stored_boxes(StoredImage(Voxels)))
+    boxes = list(tetopt.Image.stored(Voxels).boxes())
     sizes = {tuple(s.stop - s.start for s in box[:2]) for box in boxes}
     assert max(sizes) == expected
     assert sum((i.stop - i.start) * (j.stop - j.start) for i, j, _ in boxes) == shape[0] * shape[1]
@@ -101,22 +99,22 @@ def test_boxes_are_of_whole_chunks_within_what_may_be_read(shape, itemsize, chun
 @pytest.mark.parametrize("sizes", [tetopt.Sizes(smallest=3.0), tetopt.Sizes(longest=9.0, gradation=0.4)])
 def test_limits_on_sizes(sizes):
     data = noisy((40, 33, 45), np.uint16)
-    stored = StoredImage(data, OBLIQUE)
+    stored = tetopt.Image.stored(data, OBLIQUE)
     assert_same(nearest_octree(stored, 500, sizes), nearest_octree(tetopt.Image(data, OBLIQUE), 500, sizes))
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
 def test_statistics(dtype):
     data = noisy((31, 37, 43), dtype)
-    image, known = tetopt.Image(data), stored_statistics(StoredImage(Recorded(data, (7, 5, 9))))
+    image, known = tetopt.Image(data), statistics(tetopt.Image.stored(Recorded(data, (7, 5, 9))))
     assert known.noise == plain(image).noise > 1.0
     assert (known.low, known.high) == (data.min(), data.max())
     assert known.mean == pytest.approx(data.mean(dtype=np.float64), rel=1e-14)
     assert known.variance == pytest.approx(plain(image).variance, rel=1e-13)
-    assert known.scaled_noise == channels_of(source_of(image)).noise
+    assert known.scaled_noise == channels_of(plain(image)).noise
     assert known.is_whole == (dtype is np.uint16)
-    assert stored_statistics(StoredImage(np.rint(data))).is_whole
-    constant = stored_statistics(StoredImage(np.full((4, 4, 4), 3, dtype=np.uint8)))
+    assert statistics(tetopt.Image.stored(np.rint(data))).is_whole
+    constant = statistics(tetopt.Image.stored(np.full((4, 4, 4), 3, dtype=np.uint8)))
     assert constant == (3.0, 3.0, 3.0, 0.0, 0.0, 0.0, True)
     assert constant.scale == 1.0
 
@@ -125,14 +123,14 @@ def test_statistics(dtype):
 @pytest.mark.parametrize("is_masked", [False, True])
 def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeypatch):
     """Two contrasts, in whole numbers, with and without a mask; also where blocks are smaller than voxels."""
-    monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "PIECE_VOXELS", 3 * shape[-1])
+    monkeypatch.setattr("tetopt.image.PIECE_VOXELS", 3 * shape[-1])
     rng = np.random.default_rng(5)
     images = [tetopt.Image(rng.integers(0, 50, shape)) for _ in range(2)]
     mask = tetopt.Image(rng.random(shape) < 0.8) if is_masked else None
-    source = source_of(content(images, mask=mask))
+    source = plain(content(images, mask=mask))
     channels = channels_of(source)._replace(means=[3.0, -7.0], scale=1.0)
     sums = block_sums(source, channels, np.array(counts))
-    h = np.stack([values - mean for values, mean in zip(source.content.values, channels.means, strict=True)])
+    h = np.stack([values - mean for values, mean in zip(source.values, channels.means, strict=True)])
     inside = np.ones(shape, dtype=bool) if source.inside is None else source.inside
     for place in np.ndindex(*counts):
         part = tuple(
@@ -171,9 +169,9 @@ def spoiled(value, dtype=np.float32):
     ],
 )
 def test_voxels_that_no_image_takes(data, words, monkeypatch):
-    monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "READ_BYTES", 3 * 12 * data.itemsize)
+    monkeypatch.setattr("tetopt.image.READ_BYTES", 3 * 12 * data.itemsize)
     with pytest.raises(tetopt.InputError, match=words) as stored:
-        octree_mesh(StoredImage(Recorded(data, (12, 4, 12))), 100)
+        octree_mesh(tetopt.Image.stored(Recorded(data, (12, 4, 12))), 100)
     with pytest.raises(tetopt.InputError) as in_memory:
         octree_mesh(tetopt.Image(data), 100)
     assert str(stored.value) == str(in_memory.value)
@@ -183,7 +181,7 @@ def test_voxels_that_no_image_takes(data, words, monkeypatch):
 def test_targets_take_voxels_in_memory(sizes):
     voxels = Recorded(noisy((12, 12, 12), np.uint8))
     with pytest.raises(tetopt.InputError, match=r"largest and field .* this one is stored; use smallest, longest"):
-        octree_mesh(StoredImage(voxels), 100, sizes)
+        octree_mesh(tetopt.Image.stored(voxels), 100, sizes)
     assert voxels.reads == []
 
 
@@ -192,7 +190,7 @@ def test_blocks_are_bounded(monkeypatch):
     data, sizes, shortest = noisy((40, 40, 40), np.uint16), tetopt.Sizes(longest=np.inf), []
     for most in (64, 2**24):
         monkeypatch.setattr(sys.modules["tetopt.start.octree"], "MOST_BLOCKS", most)
-        mesh = nearest_octree(StoredImage(data), 1500, sizes)
+        mesh = nearest_octree(tetopt.Image.stored(data), 1500, sizes)
         assert_same(mesh, nearest_octree(tetopt.Image(data), 1500, sizes))
         shortest.append(np.linalg.norm(mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1).min())
     assert shortest[0] > 1.5 * shortest[1]

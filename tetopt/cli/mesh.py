@@ -18,7 +18,7 @@ from tetopt.io.mni import mni_path
 from tetopt.job.events import listened
 from tetopt.job.job import Job
 from tetopt.job.options import DEFAULT_NODES, has_model
-from tetopt.job.read import task_of
+from tetopt.job.read import read
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
@@ -39,12 +39,9 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
 def _predict(job: Job, display: Display) -> int:
     """Say what the run will take."""
     with listened(display):
-        task = task_of(job)
+        task = read(job)
         display.close()
-    if task.plan.n_parts is not None:
-        print_parts(task)
-    else:
-        print_prediction(task.plan, task.size)
+    task.plan.division.chosen(print_prediction, print_parts)(task)
     return 0
 
 

@@ -9,13 +9,12 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from tetopt import InputError, load_phantom, save_image
+from tetopt import Image, InputError, load_phantom, save_image
 from tetopt.cli.console import out
 from tetopt.cli.options import ForceOption, option
 from tetopt.io.files import checked_output
 from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
-from tetopt.stored import StoredImage
 
 
 def phantom_command(
@@ -40,7 +39,7 @@ def phantom_command(
     if is_folder:
         if phantom.ndim != 3:
             raise InputError(f"{output}: expected a phantom in three dimensions; write a plane as .nii.gz")
-        low, high = save_zarr(output, StoredImage(voxels, voxels.affine), voxels, np.int16)
+        low, high = save_zarr(output, Image.stored(voxels, voxels.affine), voxels, np.int16)
     else:
         image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
         low, high = image.data.min(), image.data.max()

@@ -7,15 +7,14 @@ import numba
 from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
 from tetopt.cli.console import log, out, show_warning
 from tetopt.cluster.crew import Need, counted
-from tetopt.engine.cost import RunSize, calibrated_speed, cost_model, predicted
-from tetopt.job.in_parts import parts_of
-from tetopt.job.plan import Plan
+from tetopt.engine.cost import calibrated_speed, cost_model, predicted
 from tetopt.job.task import Task
 from tetopt.start.octree import OCTREE_NODE_BYTES
 
 
-def print_prediction(plan: Plan, size: RunSize) -> None:
+def print_prediction(task: Task) -> None:
     """Say what the run takes on this machine, and how sure that is; warn where there is less memory."""
+    size = task.size
     log.print("measuring this machine, about a second")
     threads, model = numba.get_num_threads(), cost_model()
     prediction = predicted(size, threads, calibrated_speed())
@@ -27,7 +26,7 @@ def print_prediction(plan: Plan, size: RunSize) -> None:
     )
     n_bytes, share = prediction.peak_bytes, model.bytes_share
     out.print(f"{memory_words(n_bytes)} of memory at its peak, in nine of ten cases {share:.0%} less or more")
-    if plan.job.target_error is not None:
+    if task.plan.job.target_error is not None:
         out.print(f"of {size.runs} runs with {size.n_nodes} nodes: how many an error takes shows only in the run")
     free = available_bytes()
     if free is not None and n_bytes > free:
@@ -40,11 +39,10 @@ def _seconds(value: float) -> str:
 
 def print_parts(task: Task) -> None:
     """Say how many parts there will be, and what each takes."""
-    job = task.plan.job
-    assert job.nodes is not None, "filled in by `with_numbers`"
-    number, n_bytes = parts_of(task.plan, task.source.contrasts[0])
+    job, nodes = task.plan.job, task.size.n_nodes
+    number, n_bytes = task.plan.division.expected(task.source.contrasts[0], nodes)
     need = Need(number, n_bytes, job.threads, is_within=True)
-    own = OCTREE_NODE_BYTES * job.nodes
+    own = OCTREE_NODE_BYTES * nodes
     out.print(
         f"about {counted(number, 'part')} in a round, each of up to {memory_words(n_bytes)} of memory, a worker "
         f"{memory_words(need.limit_for(n_bytes))} in all; about {memory_words(own)} for this command, whose octree is "

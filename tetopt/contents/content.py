@@ -22,7 +22,6 @@ from tetopt.contents.noise import noise_level
 from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.stored import StoredImage
 
 RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
@@ -43,6 +42,24 @@ class Continuation(NamedTuple):
     nearest: NDArray[np.int64]  # (K,) for each of them outside, in C order, the flat number of the nearest one inside
 
 
+class Spread(NamedTuple):
+    """Of an image's intensities."""
+
+    mean: float
+    low: float
+    high: float
+    variance: float
+
+
+class SmoothLabels(NamedTuple):
+    """Labels whose interfaces are to be smooth."""
+
+    memberships: Memberships
+    tension: float  # voxels: how far an interface would move to save itself
+    own_channel: NDArray[np.int64]  # (K,) each label's channel, a row of `values`
+    own_value: NDArray[np.int32]  # (K,) what its voxels have there
+
+
 class Content(NamedTuple):
     """What a mesh is to represent; made by `content`.
 
@@ -50,28 +67,23 @@ class Content(NamedTuple):
     ----------
     image : Image
         The voxels, and the first contrast; only those around the mask; divided where slices are thick.
-    values : (C, s_0, ..., s_{n-1}) array
-        What is to be one value in a cell, in one unit: a channel for each contrast, and channels of the labels.
+    channels : (C, s_0, ..., s_{n-1}) array, optional
+        What is to be one value in a cell, in one unit, as whole numbers: a channel for each contrast, and channels of
+        the labels. Without them it is the image's own intensities.
     n_contrasts : int
-        The first of them: images, not labels.
+        The first of the channels: images, not labels.
     unit : float
         Squared intensity of the image for 1 squared of `values`.
-    is_plain : bool
-        Whether `values` is the image's own data, else whole numbers.
     region : Region or None
         What is to be covered; None for the image's box.
     continuation : Continuation, optional
         Of the mask that the region is of; see `tetopt.contents.content.continued`.
-    memberships : Memberships, optional
-        Of labels whose interfaces are to be smooth.
-    smoothness : float
-        Of these: how far an interface would move to save itself, in voxels.
-    own_channel : (K,) int64, optional
-        Each of these labels' channel, a row of `values`.
-    own_value : (K,) int32, optional
-        What its voxels have there.
+    smooth : SmoothLabels, optional
+        Labels whose interfaces are to be smooth.
     keeps_components : bool
         Keep connected components of a mesh that the mask does not have.
+    statistics : Statistics, optional
+        Of the image by itself, if a pass over its voxels has taken them.
 
     Examples
     --------
@@ -83,22 +95,44 @@ class Content(NamedTuple):
     """
 
     image: Image
-    values: NDArray
-    n_contrasts: int
-    unit: float
-    is_plain: bool
-    region: Region | None
+    channels: NDArray[np.int32] | None = None
+    n_contrasts: int = 1
+    unit: float = 1.0
+    region: Region | None = None
     continuation: Continuation | None = None
-    memberships: Memberships | None = None
-    smoothness: float = 0.0
-    own_channel: NDArray[np.int64] | None = None
-    own_value: NDArray[np.int32] | None = None
+    smooth: SmoothLabels | None = None
     keeps_components: bool = False
+    statistics: Statistics | None = None
+
+    @property
+    def memberships(self) -> Memberships | None:
+        """Of labels whose interfaces are to be smooth, of each a level."""
+        return None if self.smooth is None else self.smooth.memberships
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the only channel is the image's own intensities."""
+        return self.channels is None
+
+    @property
+    def n_channels(self) -> int:
+        """How many channels there are."""
+        return 1 if self.channels is None else len(self.channels)
+
+    @property
+    def values(self) -> NDArray:
+        """All channels, (C, s_0, ..., s_{n-1}), in memory."""
+        return self.image.data[None] if self.channels is None else self.channels
+
+    @property
+    def inside(self) -> NDArray[np.bool_] | None:
+        """Which voxels are to be covered, if not all."""
+        return None if self.region is None else self.region.inside
 
     @property
     def n_voxels(self) -> int:
         """Voxels to be covered."""
-        return self.image.data.size if self.region is None else int(self.region.inside.sum())
+        return prod(self.image.shape) if self.region is None else int(self.region.inside.sum())
 
     @property
     def volume(self) -> float:
@@ -108,7 +142,18 @@ class Content(NamedTuple):
     @property
     def variance(self) -> float:
         """Variance over the voxels to be covered, of all channels, intensity^2; times `volume`: E_D of one cell."""
+        if self.statistics is not None and self.is_plain and self.region is None:
+            return self.statistics.variance
         return self.unit * sum(_variance(values, self.region) for values in self.values)
+
+    @property
+    def spread(self) -> Spread:
+        """Of the intensities of the image's voxels, whichever are to be covered."""
+        if self.statistics is not None:
+            return Spread(*self.statistics[:4])
+        data = self.image.data
+        mean, low, high = float(data.mean(dtype=np.float64)), float(data.min()), float(data.max())
+        return Spread(mean, low, high, _variance(data, None))
 
     @property
     def wrong_side(self) -> float:
@@ -118,30 +163,7 @@ class Content(NamedTuple):
     @property
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
-        inside = None if self.region is None else self.region.inside
-        return float(sum(noise_level(values, inside) ** 2 for values in self.values[: self.n_contrasts]))
-
-
-class StoredContent(NamedTuple):
-    """One image whose voxels stay in their file, as what a mesh of its box is to represent."""
-
-    image: StoredImage
-    statistics: Statistics
-
-    @property
-    def n_voxels(self) -> int:
-        """As of `Content`."""
-        return prod(self.image.shape)
-
-    @property
-    def volume(self) -> float:
-        """As of `Content`."""
-        return self.image.volume
-
-    @property
-    def variance(self) -> float:
-        """As of `Content`."""
-        return self.statistics.variance
+        return float(sum(noise_level(values, self.inside) ** 2 for values in self.values[: self.n_contrasts]))
 
 
 def content(
@@ -229,14 +251,13 @@ def content(
         raise InputError("weights: nothing that differs between voxels counts; give one above 0")
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
-    result = Content(images[0], values, len(contrasts), unit / scale**2, False, region, beyond)
-    result = result._replace(keeps_components=keep_components)
+    result = Content(
+        images[0], values, len(contrasts), unit / scale**2, region, beyond, keeps_components=keep_components
+    )
     if members is None:
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)
-    return result._replace(
-        memberships=members, smoothness=smooth_interfaces, own_channel=channel.astype(np.int64), own_value=value
-    )
+    return result._replace(smooth=SmoothLabels(members, smooth_interfaces, channel.astype(np.int64), value))
 
 
 def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Region:
@@ -283,7 +304,7 @@ def _whole_numbers(
 
 def plain(image: Image | Content) -> Content:
     """An image by itself; a content is returned as it is."""
-    return image if isinstance(image, Content) else Content(image, image.data[None], 1, 1.0, True, None)
+    return image if isinstance(image, Content) else Content(image)
 
 
 def _variance(values: NDArray, region: Region | None) -> float:
@@ -329,9 +350,7 @@ def continued(image: Image, mask: Image | Continuation | None) -> Image:
 
 
 def _part(image: Image, part: tuple[slice, ...]) -> Image:
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([s.start for s in part])
-    return Image(image.data[part], affine)
+    return image.box([s.start for s in part], [s.stop for s in part])
 
 
 def check_weights(n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float) -> None:

@@ -6,27 +6,21 @@ bits however the volume is cut into boxes, and whether it is stored or in memory
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
 from tetopt.contents.noise import NoiseSample, noise_places, sampled_noise
-from tetopt.image import check_finite, check_intensities, check_kind
-from tetopt.stored import StoredImage
+from tetopt.image import Image, check_finite, check_intensities, check_kind, pieces
 
-READ_BYTES = 2**28  # of a stored volume at a time, at most: 128 planes of 1024^2 voxels of 16 bits
-PIECE_VOXELS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
 # Of the noise's planes, of each voxel: three times as doubles, and what second differences of them are made of.
 NOISE_PLANE_BYTES = 120.0
 
-Box = tuple[slice, slice, slice]
-
 
 class Statistics(NamedTuple):
-    """Of all voxels of a stored image; made by `stored_statistics`.
+    """Of all voxels of a volume; made by `tetopt.contents.statistics.statistics`.
 
     Parameters
     ----------
@@ -43,9 +37,9 @@ class Statistics(NamedTuple):
 
     Examples
     --------
-    >>> from tetopt.contents.statistics import stored_statistics
+    >>> from tetopt.contents.statistics import statistics
     >>> voxels = np.arange(4096, dtype=np.int16).reshape(16, 16, 16)
-    >>> numbers = stored_statistics(tetopt.StoredImage(voxels))
+    >>> numbers = statistics(tetopt.Image.stored(voxels))
     >>> numbers.low, numbers.high, numbers.mean, numbers.is_whole
     (0.0, 4095.0, 2047.5, True)
     """
@@ -64,13 +58,13 @@ class Statistics(NamedTuple):
         return max(abs(self.low - self.mean), abs(self.high - self.mean)) or 1.0
 
 
-def stored_statistics(image: StoredImage) -> Statistics:
-    """Statistics of a stored image from one pass, of which `octree_mesh` and parts need a few.
+def statistics(image: Image) -> Statistics:
+    """Statistics of a volume from one pass over its voxels, of which `octree_mesh` and parts need a few.
 
     Parameters
     ----------
-    image : StoredImage
-        Read in boxes of `READ_BYTES` at most.
+    image : Image
+        In three dimensions; read by its boxes.
 
     Returns
     -------
@@ -86,13 +80,13 @@ def stored_statistics(image: StoredImage) -> Statistics:
     check_kind(image.voxels.dtype)
     stride, middles = noise_places(shape)
     n_voxels, need = float(np.prod(shape, dtype=np.float64)), NOISE_PLANE_BYTES * len(middles) * shape[1] * shape[2]
-    check_memory(need + 2.0 * READ_BYTES, f"image: {n_voxels:.3g} voxels", "turn its shortest axis to the last")
+    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "turn its shortest axis to the last")
     sums, squares = np.empty(shape[:2]), np.empty(shape[:2])
     near = np.empty((3, len(middles), *shape[1:]))
     places = np.unravel_index(np.arange(0, int(n_voxels), stride), shape)
     sample = np.empty(len(places[0]))
     low, high, is_whole, n_bad, first_bad = np.inf, -np.inf, True, 0, shape
-    for box in stored_boxes(image):
+    for box in image.boxes():
         values = image.read([s.start for s in box], [s.stop for s in box])
         for k in range(3):
             for number in np.flatnonzero((middles + k - 1 >= box[0].start) & (middles + k - 1 < box[0].stop)):
@@ -134,46 +128,3 @@ def row_sums(part: NDArray[np.float64]) -> NDArray[np.float64]:
 def mean_of(sums: NDArray[np.float64], n_voxels: float) -> float:
     """The mean of so many voxels of which these are the sums of all rows, (s_0, s_1)."""
     return float(sums.sum() / n_voxels)
-
-
-def pieces(shape: Sequence[int]) -> Iterator[Box]:
-    """Boxes of whole rows that a box of voxels (P, R, K) is computed in: plane by plane, and rows in their order."""
-    n_rows = min(shape[1], max(PIECE_VOXELS // shape[2], 1))
-    return _boxes(shape, max(PIECE_VOXELS // (n_rows * shape[2]), 1), n_rows)
-
-
-def slabs(shape: Sequence[int]) -> Iterator[Box]:
-    """Boxes of whole planes that voxels in memory are gone over in."""
-    return _boxes(shape, max(PIECE_VOXELS // (shape[1] * shape[2]), 1), shape[1])
-
-
-def stored_boxes(image: StoredImage) -> Iterator[Box]:
-    """Boxes of whole rows that a stored image is read in: as thick as its chunks, and `READ_BYTES` at most.
-
-    A single row is read whole, whatever it takes.
-    """
-    (s0, s1, s2), chunks = image.shape, getattr(image.voxels, "chunks", None)
-    row_bytes = s2 * np.dtype(image.voxels.dtype).itemsize
-    most_rows = max(READ_BYTES // row_bytes, 1)
-    if chunks:
-        # Those of dask are all told, along each axis.
-        n_planes, step = (min(int(np.max(sizes)), s) for sizes, s in zip(chunks[:2], (s0, s1), strict=True))
-    elif _is_first_axis_fastest(image.voxels):
-        n_planes, step = s0, 1
-    else:
-        n_planes, step = max(min(s0, most_rows // s1), 1), 1
-    n_planes = min(n_planes, most_rows)
-    n_rows = most_rows // n_planes
-    return _boxes((s0, s1, s2), n_planes, min(n_rows // step * step or n_rows, s1))
-
-
-def _is_first_axis_fastest(voxels: Any) -> bool:
-    """Whether a mapped array lies in a file as NIfTI has it, so that planes along the first axis are all over it."""
-    strides = getattr(voxels, "strides", None)
-    return strides is not None and abs(strides[0]) < abs(strides[-1])
-
-
-def _boxes(shape: Sequence[int], n_planes: int, n_rows: int) -> Iterator[Box]:
-    for i in range(0, shape[0], n_planes):
-        for j in range(0, shape[1], n_rows):
-            yield slice(i, min(i + n_planes, shape[0])), slice(j, min(j + n_rows, shape[1])), slice(0, shape[2])

@@ -35,7 +35,7 @@ from tetopt.contents.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.kernel_cache import njit
 from tetopt.kernels import (
     Floats1,
@@ -310,7 +310,7 @@ def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.floa
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
 
 
-def nearest_voxels(image: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.int64]:
+def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Index of the voxel nearest to each world point, (K, n) int64; points outside take the border's."""
     index = np.rint(image.to_index(points)).astype(np.int64)
     return np.clip(index, 0, np.array(image.shape) - 1)
@@ -365,7 +365,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = 
     return SamplingGrid(prefix, bits, float(shift))
 
 
-def grid_bits(image: VoxelGrid, points: NDArray[np.float64]) -> int:
+def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as `sampling_grid`."""
     if points.shape[1] != image.ndim:
         raise InputError(

@@ -173,7 +173,7 @@ def optimize(
         run.mend_surfaces(False, floor)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    result = MeshingResult(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
+    result = MeshingResult(run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped)
     return promised(result, content, floor, mesh)
 
 
@@ -384,8 +384,10 @@ class Run:
         return made.n_split + made.n_collapsed
 
     def give_labels(self) -> None:
-        """Give each cell a label, and let nodes between labels slide from now on."""
-        self.state = with_labels(self.state, self.content, self.mesh())
+        """Give each cell a label, if the content has any, and let nodes between labels slide from now on."""
+        if self.content.smooth is None:
+            return
+        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh())
         self.has_labels = True
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
@@ -461,8 +463,8 @@ class Run:
                     n_gone += self._take_out(is_flat)
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
             n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
-        if self.has_labels:
-            mend_pinches(self.state, self.content, self.mesh())
+        if self.has_labels and self.content.memberships is not None:
+            mend_pinches(self.state, self.image, self.content.memberships, self.mesh())
         return n_gone
 
     @property
@@ -502,7 +504,7 @@ class Run:
         """The row of the history that tells how things stand."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
-        E_G, squares = content_energies(self.state, self.content, len(self.content.values))
+        E_G, squares = content_energies(self.state, self.content, self.content.n_channels)
         n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
         E_D = squares * self.content.unit * self.image.voxel_volume
         return IterationRecord(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)

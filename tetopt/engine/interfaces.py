@@ -11,7 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content
+from tetopt.contents.content import Content, SmoothLabels
+from tetopt.contents.memberships import Memberships
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
 from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_pieces
@@ -19,6 +20,7 @@ from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import facets
+from tetopt.image import Image
 from tetopt.kernels import Floats1, Ints1, entry, helper, unit
 from tetopt.mesh import Mesh
 
@@ -26,24 +28,21 @@ RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
 LEAST_RELABELLING_SHARE = 1e-9  # of the energies weighed: a smaller gain may be rounding
 
 
-def with_labels(state: State, content: Content, mesh: Mesh) -> State:
-    """The state with a label for each cell, and an objective that counts what is not of it."""
-    members, own_channel, own_value = content.memberships, content.own_channel, content.own_value
-    assert members is not None
-    assert own_channel is not None
-    assert own_value is not None
+def with_labels(state: State, content: Content, smooth: SmoothLabels, mesh: Mesh) -> State:
+    """The state with a label for each cell, of the content's, and an objective that counts what is not of it."""
+    members, tension, own_channel, own_value = smooth
     pieces = voxel_pieces(members.partition, len(members.labels))
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     state.complex.labels[:n_cells] = labelled(
-        mesh.points, mesh.cells, across, cell_counts(content, mesh), pieces
+        mesh.points, mesh.cells, across, cell_counts(image, members, mesh), pieces
     ).labels
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
-        tension=float(state.objective.image * content.smoothness * step / image.voxel_volume),
+        tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
     state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
@@ -51,20 +50,19 @@ def with_labels(state: State, content: Content, mesh: Mesh) -> State:
     return state
 
 
-def mend_pinches(state: State, content: Content, mesh: Mesh) -> None:
+def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh) -> None:
     """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
-        labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(content, mesh), labels)
+        labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(image, members, mesh), labels)
         _meet_everywhere(state, node_rings(state))
 
 
-def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:
+def cell_counts(image: Image, members: Memberships, mesh: Mesh) -> scipy.sparse.csr_array:
     """Voxels of each label in each cell, (M, K); of a cell without voxels its size in those of its centroid's label."""
-    assert content.memberships is not None
-    image, partition = content.image, content.memberships.partition
-    owner, n_labels = cell_of_voxel(image, mesh).ravel(), len(content.memberships.labels)
+    partition = members.partition
+    owner, n_labels = cell_of_voxel(image, mesh).ravel(), len(members.labels)
     is_in, shape = owner >= 0, (len(mesh.cells), n_labels)
     counts = scipy.sparse.csr_array((np.ones(int(is_in.sum())), (owner[is_in], partition.ravel()[is_in])), shape=shape)
     empty = np.flatnonzero(counts.sum(axis=1) == 0.0)

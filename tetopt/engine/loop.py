@@ -103,7 +103,7 @@ class MeshingResult(NamedTuple):
         A row an iteration, the initial mesh's first.
     ended : {"iterations", "converged", "max_seconds", "stopped"}
         Why the run ended.
-    initial : Mesh, optional
+    initial : Mesh
         The mesh that the run began with.
     nodes : int, optional
         The number that the run was to have, asked for or what a target error takes.
@@ -133,7 +133,7 @@ class MeshingResult(NamedTuple):
     mesh: Mesh
     history: list[IterationRecord]
     ended: str
-    initial: Mesh | None = None
+    initial: Mesh
     nodes: int | None = None
     seconds_start: float = 0.0
     seconds_run: float = 0.0

@@ -12,12 +12,13 @@ import inspect
 import time
 from collections.abc import Callable
 from difflib import get_close_matches
+from math import prod
 from typing import Any, Literal
 
 import numpy as np
 
 from tetopt.budget import check_memory
-from tetopt.contents.content import Content, StoredContent, plain
+from tetopt.contents.content import Content, plain
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
@@ -200,16 +201,14 @@ def mesh_image(
 
     def begun(corners: int | None) -> MeshingResult:
         if mode == "graded":
-            assert corners is not None
             # The longest edge of order 2 may leave no octree near to so few corners: exchanges take out what they can.
-            return run((octree_mesh if order == 1 else nearest_octree)(content, corners, sizes), corners)
+            return run((octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes), corners)
         return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
 
     begin = time.perf_counter()
     if target_error is not None:
         result = meshed_to_error(content, target_error, sizes, run)
-    elif mode == "start":
-        assert start is not None
+    elif start is not None:
         result = run(start, None)
     elif order == 2 and nodes is not None:
         result = meshed_in_all(content.image.ndim, nodes, begun)
@@ -230,7 +229,7 @@ def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:
 def bytes_of(content: Content, nodes: int) -> float:
     """What meshing a content with so many nodes takes besides what there is; see `tetopt.engine.cost.meshing_bytes`."""
     image = content.image
-    return meshing_bytes(image.data.size, len(content.values) + (content.region is not None), nodes, image.ndim)
+    return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
 
 
 def check_target_error(target_error: float) -> None:
@@ -242,7 +241,7 @@ def check_target_error(target_error: float) -> None:
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
     """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
     shape = " x ".join(map(str, content.image.shape))
-    what = f"an image of {shape} voxels" + (f" of {len(content.values)} channels" if len(content.values) > 1 else "")
+    what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
     check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or allow more", limit)
     check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
 
@@ -285,9 +284,7 @@ def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int
         raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
 
 
-def sizes_of_order(
-    content: Content | StoredContent, nodes: int | None, sizes: Sizes | None, order: int
-) -> Sizes | None:
+def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
     """The limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 the longest edge, too."""
     if order == 1:
         return sizes
@@ -308,7 +305,7 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
     The result of the run that is nearest, or of one that was cut short.
     """
     corners, ratio = 0, QUADRATIC_NODES[ndim]
-    best: tuple[float, MeshingResult] | None = None
+    tried: list[tuple[float, MeshingResult]] = []
     for _ in range(NODE_RUNS):
         before, corners = corners, max(round(nodes / ratio), 2 ** (ndim + 1))
         if corners == before:
@@ -317,12 +314,10 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
         count = node_count(result.mesh.points, result.mesh.cells, 2)
         ratio = count / len(result.mesh.points)
         miss = abs(count / nodes - 1.0)
-        if best is None or miss < best[0]:
-            best = miss, result
+        tried.append((miss, result))
         if miss <= NODES_NEAR or result.ended in CUT_SHORT:
             break
-    assert best is not None
-    return best[1]
+    return min(tried, key=lambda each: each[0])[1]
 
 
 def meshed_to_error(
@@ -353,7 +348,7 @@ def meshed_to_error(
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, shares = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
-    best: MeshingResult | None = None
+    results: list[MeshingResult] = []
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
         nodes = max(nodes, fewest)
@@ -367,18 +362,26 @@ def meshed_to_error(
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
         count, share = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
         if result.ended in CUT_SHORT:
-            return best if best is not None and shares[len(best.mesh.points)] <= target_error else result
+            reached = [each for each in results if shares[len(each.mesh.points)] <= target_error]
+            return _best(reached, shares, target_error) if reached else result
         if count in shares:
             break
         shares[count] = share
-        if best is None or _is_better(count, len(best.mesh.points), shares, target_error):
-            best = result
+        results.append(result)
         if ERROR_REACHED * target_error <= share <= target_error:
             return result
         nodes = _next_nodes(content.image, shares, target_error)
         if nodes in shares:
             break
-    assert best is not None
+    return _best(results, shares, target_error)
+
+
+def _best(results: list[MeshingResult], shares: dict[int, float], target: float) -> MeshingResult:
+    """The first of the results than which none is better."""
+    best = results[0]
+    for result in results[1:]:
+        if _is_better(len(result.mesh.points), len(best.mesh.points), shares, target):
+            best = result
     return best
 
 
@@ -398,7 +401,6 @@ def _next_nodes(image: Image, shares: dict[int, float], target: float) -> int:
     if above is not None and below is not None and above < below:
         part = np.log(shares[above] / aim) / np.log(shares[above] / max(shares[below], least))
         return int(above * (below / above) ** part)
-    nearest = above if above is not None else below
-    assert nearest is not None
+    nearest = min(shares) if above is None else above
     ratio = max(shares[nearest], least) / aim
-    return int(np.clip(nearest * ratio ** (1.0 / ERROR_RATE), 2 ** (image.ndim + 2), max(image.data.size // 8, 64)))
+    return int(np.clip(nearest * ratio ** (1.0 / ERROR_RATE), 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))

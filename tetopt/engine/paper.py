@@ -160,7 +160,7 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
-    return promised(MeshingResult(Mesh(points, _cells(state)), history, ended), plain(image), 0.0, mesh)
+    return promised(MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh)
 
 
 def _cells(state: State) -> NDArray[np.int64]:

@@ -7,19 +7,21 @@ command line ends with 1 there.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from math import prod
 
 import numpy as np
 
 from tetopt.check import beyond_box, manifold_problems
 from tetopt.contents.content import Content
+from tetopt.contents.domain import Region
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.simplex import dihedral_angles, volumes
 from tetopt.geometry.topology import components
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 
@@ -56,10 +58,12 @@ def promised(result: MeshingResult, content: Content, min_dihedral: float, start
         of more than 200 voxels that no cell has. A requirement that could not be checked, for want of memory, is
         missed, too, with the reason: the mesh is not lost for it.
     """
-    of_domain = {"cover": lambda: _missed_cover(result, start)} if content.region is None else {
-        "mask": lambda: _missed_mask(content, result),
-        "components": lambda: _missed_components(content, result.mesh),
-    }  # fmt: skip
+    of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _missed_cover(result, start)}
+    if content.region is not None:
+        of_domain = {
+            "mask": partial(_missed_mask, content.image, content.region, result),
+            "components": partial(_missed_components, content.region, result.mesh),
+        }
     checks: dict[str, Callable[[], dict[str, str]]] = {
         "floor": lambda: _missed_floor(result, min_dihedral),
         "box": lambda: _beyond(result.mesh, start, content.image),
@@ -84,7 +88,7 @@ def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
     return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed else {}
 
 
-def promised_in_box(result: MeshingResult, grid: VoxelGrid, min_dihedral: float) -> MeshingResult:
+def promised_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
     """As `promised`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
     missed = _missed_floor(result, min_dihedral) | _missed_box(grid, result)
     beyond = float(beyond_box(result.mesh, grid).max())
@@ -120,7 +124,7 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
     return result._replace(missed=missed, share=share)
 
 
-def _missed_box(image: VoxelGrid, result: MeshingResult) -> dict[str, str]:
+def _missed_box(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
@@ -137,10 +141,9 @@ def _missed_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
-def _missed_mask(content: Content, result: MeshingResult) -> dict[str, str]:
-    assert content.region is not None
+def _missed_mask(image: Image, region: Region, result: MeshingResult) -> dict[str, str]:
     missed = {}
-    is_covered, inside = cell_of_voxel(content.image, result.mesh) >= 0, content.region.inside
+    is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
         missed["overlap"] = (
             f"cells overlap: together they hold {twice} voxels twice; allow more nodes, and please report this"
@@ -154,10 +157,9 @@ def _missed_mask(content: Content, result: MeshingResult) -> dict[str, str]:
     return missed
 
 
-def _missed_components(content: Content, mesh: Mesh) -> dict[str, str]:
-    assert content.region is not None
+def _missed_components(region: Region, mesh: Mesh) -> dict[str, str]:
     n_cells = np.sort(np.bincount(components(mesh.cells)))[::-1]
-    if len(n_cells) == 1 or len(n_cells) <= (n_mask := n_components(content.region)):
+    if len(n_cells) == 1 or len(n_cells) <= (n_mask := n_components(region)):
         return {}
     words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
     return {"components": f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells; allow more nodes"}

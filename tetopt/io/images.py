@@ -26,7 +26,7 @@ from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, warn
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
@@ -43,7 +43,6 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
-from tetopt.stored import StoredImage
 
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
@@ -138,7 +137,6 @@ def load_image(
     """
     path = Path(path)
     notes: list[str] = []
-    whole: VoxelGrid
     try:
         with os_errors_named():
             is_stored = is_zarr(path)
@@ -599,7 +597,7 @@ def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
     return [f"{guess}; if they matter, convert it again with its sform or qform"]
 
 
-def notes_of_size(image: VoxelGrid) -> list[str]:
+def notes_of_size(image: Image) -> list[str]:
     """What to warn of where micrometres or metres were taken for mm."""
     steps = np.linalg.norm(image.affine[:-1, :-1], axis=0)
     longest = float((steps * image.shape).max())
@@ -688,7 +686,7 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
 
 
-def _part_of_stored(image: StoredImage, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]) -> Image:
+def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]) -> Image:
     """The same of an image of Zarr's: only this part of it is read."""
     bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
     if slice_ is not None:

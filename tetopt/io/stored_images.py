@@ -27,13 +27,12 @@ from tetopt.io.images import (
 from tetopt.io.itk_headers import HEADED_SUFFIXES
 from tetopt.io.volumes import VoxelsInFile, check_room
 from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
-from tetopt.stored import StoredImage
 
 STORED_SUFFIXES = (ZARR_SUFFIX, ".nii")
 _PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
 
 
-def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> StoredImage:
+def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> Image:
     """An image whose voxels are left where they are.
 
     Parameters
@@ -49,7 +48,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
 
     Returns
     -------
-    StoredImage
+    Image
         What it reads of a file is what `tetopt.load_image` has there, to the bit, and so is the affine. A box that
         cannot be read is an InputError that names the voxels.
 
@@ -96,9 +95,10 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
 
 
 def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = None) -> Image | None:
-    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, whole in memory, in its own place.
+    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, in its own place.
 
-    None of an image without such a level, and of files that have no levels.
+    Its voxels stay in the file until they are drawn, but are read once, so that what is wrong with them shows. None of
+    an image without such a level, and of files that have no levels.
 
     Raises
     ------
@@ -116,7 +116,8 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
         image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume)
         check_chunks(image.voxels, [])
         check_room(image.shape, image.voxels.dtype.itemsize)
-        return image.box((0, 0, 0), image.shape)
+        image.box((0, 0, 0), image.shape)
+        return image
     except InputError as error:
         raise named_error(path, error) from error
 
@@ -150,7 +151,7 @@ def check_local(path: str | Path) -> None:
         raise InputError(f"{path}: is not on this machine; download it, only folders and files here are read")
 
 
-def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
     with os_errors_named():
         if is_zarr(path):
             return open_zarr(zarr_levels(path, notes)[0], volume)
@@ -166,10 +167,10 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
     raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
 
 
-def _cropped(image: StoredImage, ranges: list[tuple[int, int]]) -> StoredImage:
+def _cropped(image: Image, ranges: list[tuple[int, int]]) -> Image:
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return StoredImage(image.voxels.within(ranges), affine)
+    return Image.stored(image.voxels.within(ranges), affine)
 
 
 class _Scaled:
@@ -183,7 +184,7 @@ class _Scaled:
         return apply_read_scaling(np.array(self.mapped[picks]), self.slope, self.inter)
 
 
-def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> Image:
     proxy, index, affine = nibabel_voxels(path, volume, notes)
     if len(proxy.shape) < 3:
         raise InputError(f"expected a volume, got a plane of {proxy.shape} voxels")
@@ -193,4 +194,4 @@ def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredIma
     scaled = _Scaled(mapped, proxy.slope, proxy.inter)
     voxels = VoxelsInFile(path, scaled, (*(slice(0, size) for size in shape[:3]), *index))
     voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
-    return StoredImage(voxels, affine)
+    return Image.stored(voxels, affine)

@@ -20,13 +20,12 @@ from numpy.typing import DTypeLike, NDArray
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
-from tetopt.image import VoxelGrid, checked_affine
+from tetopt.image import Image, checked_affine
 from tetopt.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 from tetopt.io.files import folder_written_whole
 from tetopt.io.text import plain
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
 from tetopt.io.zarr_codecs import PACKERS, bounded
-from tetopt.stored import StoredImage
 
 ZARR_SUFFIX = ".zarr"
 NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
@@ -88,7 +87,7 @@ def is_node(path: Path) -> bool:
     return any((path / name).exists() for name in NODE_FILES)
 
 
-def open_zarr(level: ZarrLevel, volume: int | None) -> StoredImage:
+def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
     """One volume of a level, of which nothing is read.
 
     Raises
@@ -103,7 +102,7 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> StoredImage:
     for axis, at in zip(level.others, index, strict=True):
         picks[axis] = at
     voxels = VoxelsInFile(level.folder, bounded(level.array), tuple(picks), level.array.chunks)
-    return StoredImage(voxels, level.affine)
+    return Image.stored(voxels, level.affine)
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
@@ -142,7 +141,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     return [levels[0]._replace(affine=own), *(each._replace(affine=turn @ each.affine) for each in levels[1:])]
 
 
-def save_zarr(path: Path, image: VoxelGrid, voxels: Any, dtype: DTypeLike) -> tuple[float, float]:
+def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[float, float]:
     """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
 
     Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of a voxel's edges and
@@ -152,7 +151,7 @@ def save_zarr(path: Path, image: VoxelGrid, voxels: Any, dtype: DTypeLike) -> tu
     ----------
     path : Path
         Replaces a folder of Zarr's that is there; ask `tetopt.io.files.checked_output` first.
-    image : VoxelGrid
+    image : Image
         Whose place they have, three-dimensional.
     voxels : Any
         What gives them for a tuple of slices, chunk after chunk.
@@ -205,7 +204,7 @@ def _stored_values(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
     return block.astype(dtype)
 
 
-def _multiscale(image: VoxelGrid) -> dict[str, Any]:
+def _multiscale(image: Image) -> dict[str, Any]:
     """NGFF's words for one array of voxels."""
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
     transforms = [

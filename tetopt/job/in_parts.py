@@ -16,74 +16,43 @@ import numpy as np
 
 import tetopt
 from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
-from tetopt.cluster.crew import Folders, Need, counted
+from tetopt.cluster.crew import Folders, Need, Workers, counted
 from tetopt.cluster.tasks import run_tasks
 from tetopt.cluster.workers import check_choice, local_share, workers
-from tetopt.contents.content import StoredContent
-from tetopt.contents.statistics import stored_statistics
+from tetopt.contents.content import Content
+from tetopt.contents.statistics import statistics
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.io.images import file_shape, parse_crop
-from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
+from tetopt.io.label_tables import NO_TABLE
+from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, warning
-from tetopt.job.options import DEFAULT_NODES, PartsOptions, stated_part
+from tetopt.job.options import DEFAULT_NODES, JobOptions, PartsOptions, stated_part
 from tetopt.job.plan import Plan
 from tetopt.job.predict import cropped_shape
 from tetopt.job.request import checksum
 from tetopt.job.source import Source
+from tetopt.job.task import Task
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of, box_text
+from tetopt.parts.division import Division, work_folder
 from tetopt.parts.part import work_on
-from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, expected_parts, mesh_in_parts
-from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, removed
-from tetopt.start.sizes import Sizes
-from tetopt.stored import StoredImage
+from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, mesh_in_parts
+from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, identity, removed
 
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
-FEWEST_NODES_EACH = 100  # of a part: of 150 half are shared, and stay
-WORK_SUFFIX = ".work"  # of the work directory beside the mesh, after its name
-WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
-
-
-class StoredSource(NamedTuple):
-    """As `Source`, an image whose voxels stay in its file."""
-
-    paths: list[Path]
-    content: StoredContent
-    about: dict[str, Any]
-    table: LabelTable = NO_TABLE
-    labels: None = None
-    mask: None = None
-    mask_word: str = "mask"
-    image: None = None  # in memory
-
-    @property
-    def contrasts(self) -> list[StoredImage]:
-        """The one image."""
-        return [self.content.image]
-
-    @property
-    def low(self) -> float:
-        """The least intensity."""
-        return self.content.statistics.low
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether it has one value everywhere."""
-        return self.content.statistics.low == self.content.statistics.high
-
-    def coarse(self) -> Image:
-        """A level of it for pictures, in memory."""
-        image = coarse_image(self.paths[0], MOST_DRAWN)
-        assert image is not None, "asked for in `read_stored`"
-        return image
+# Options that look at all cells or voxels at once, and the values of them that parts take besides none at all.
+PARTS_TAKE: dict[str, Any] = {
+    "mask": None, "background": None, "labels": None, "slice_": None, "target_error": None, "size_max": None,
+    "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
+}  # fmt: skip
+LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # likewise, if the image is left in its file
 
 
 def with_parts(plan: Plan) -> Plan:
@@ -115,7 +84,8 @@ def with_parts(plan: Plan) -> Plan:
     if job.worker_gb is not None and (job.scheduler or job.cluster):
         raise InputError("`worker_gb`: of workers on this machine; those of `scheduler` and `cluster` have their own")
     check_choice(job.workers, job.scheduler, job.cluster, "blocks")
-    return plan._replace(n_parts=job.parts or 1)
+    file = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
+    return plan._replace(division=Division(job.parts or 1), left=file if _is_left(plan) else None)
 
 
 def _is_storable(path: Path) -> bool:
@@ -145,25 +115,18 @@ def _strange_option(plan: Plan) -> str | None:
         return "`parts`: of a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
     if len(job.images) > 1:
         return f"`parts`: expected one IMAGE, got {len(job.images)}; leave the others out, or `parts`"
-    whole = {
-        "mask": job.mask, "background": job.background, "labels": job.labels, "slice_": job.slice_,
-        "target_error": job.target_error, "size_max": job.size_max, "sizing": job.sizing,
-        "max_gb": job.max_gb, "order": job.order if job.order == 2 else None,
-        "boundary": "fixed" if job.boundary == "fixed" else None,
-    }  # fmt: skip
-    return next((f"`{name}`: {WHOLE_ONLY}" for name, value in whole.items() if value is not None), None)
+    return _whole_only(plan, PARTS_TAKE)
 
 
-def _check_number(n_parts: int | None, nodes: int) -> None:
-    """InputError for so many parts that hardly a node of them is their own."""
-    most = max(nodes // FEWEST_NODES_EACH, 1)
-    if n_parts is not None and n_parts > most:
-        raise InputError(
-            f"`parts`: expected up to {most} of {nodes} nodes, {FEWEST_NODES_EACH} each, got {n_parts}; ask for fewer"
-        )
+def _whole_only(plan: Plan, taken: dict[str, Any]) -> str | None:
+    """The first of the options that has another value than none and the one that is taken, in words."""
+    for name, value in taken.items():
+        if getattr(plan.job, name) not in (None, value):
+            return f"`{name}`: looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
+    return None
 
 
-def is_left_stored(plan: Plan) -> bool:
+def _is_left(plan: Plan) -> bool:
     """Whether the image of a run in parts is left in its file: a large one, or one that does not fit into memory."""
     if not _is_storable(plan.job.images[0]):
         return False
@@ -171,45 +134,29 @@ def is_left_stored(plan: Plan) -> bool:
     return _n_voxels(plan) > MOST_LOADED or (needed is not None and free is not None and needed > free)
 
 
-def read_stored(plan: Plan) -> StoredSource:
-    """The image of a run in parts, left in its file, of which one pass takes the statistics."""
-    path = plan.job.images[0]
-    if plan.job.average not in (None, DEFAULT_AVERAGE):
-        raise InputError(f"`average`: {WHOLE_ONLY}")
+def left_source(plan: Plan) -> Source | None:
+    """The image of a run in parts that is left in its file, of which one pass takes the statistics; None of others."""
+    if plan.left is None:
+        return None
+    path = plan.left.path
+    if (strange := _whole_only(plan, LEFT_TAKE)) is not None:
+        raise InputError(strange)
     if plan.job.young is not None:
         note("`young`: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
-    if plan.pictures and (plan.job.crop is not None or coarse_image(path, MOST_DRAWN) is None):
+    level = coarse_image(path, MOST_DRAWN) if plan.pictures and plan.job.crop is None else None
+    if plan.pictures and level is None:
         raise InputError(
             f"`figures`: {path} has no level of {MOST_DRAWN:.3g} voxels or fewer to draw, or is cropped; leave it out"
         )
-    file = _volume_file(plan)
-    image = open_stored(file.path, volume=file.volume, crop=file.crop)
+    image = open_stored(path, volume=plan.left.volume, crop=plan.left.crop)
     note(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file")
     about = {
         "image": path.name, "image_sha256": checksum(path), "box": box_text(box_of(image)),
         "inputs": {"images": [path.name], "weights": [1.0], "mask": None, "background": None, "labels": None,
                    "label_weight": None, "sha256": {}},
     }  # fmt: skip
-    return StoredSource([path], StoredContent(image, stored_statistics(image)), about)
-
-
-def _volume_file(plan: Plan) -> VolumeFile:
-    job = plan.job
-    return VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
-
-
-def parts_of(plan: Plan, image: VoxelGrid) -> tuple[int, float]:
-    """How many parts there will be in a round, and the memory that each takes, bytes; InputError for too many."""
-    nodes = plan.job.nodes
-    assert nodes is not None, "filled in by `with_numbers`"
-    _check_number(plan.n_parts, nodes)
-    return expected_parts(image, nodes, plan.n_parts or 1)
-
-
-def work_folder(plan: Plan) -> Path:
-    """Where what a run in parts has done lies until it is complete."""
-    mesh = plan.job.output
-    return mesh.with_name(mesh.name + WORK_SUFFIX)
+    content = Content(image, statistics=statistics(image))
+    return Source([path], [1.0], content, [image], None, None, about, NO_TABLE, image if level is None else level)
 
 
 class PartsProgress(NamedTuple):
@@ -220,17 +167,14 @@ class PartsProgress(NamedTuple):
 
 
 def run_in_parts(
-    plan: Plan, source: Source | StoredSource, sizes: Sizes | None, check: Callable[[Mesh], None],
-    stop: Callable[[], bool], begin: float,
+    task: Task, check: Callable[[Mesh], None], stop: Callable[[], bool], ends: float | None
 ) -> tuple[Parted, float]:  # fmt: skip
     """Run, or go on with, a mesh in parts; what came of it, and the memory predicted for each worker's task, bytes.
 
-    `check` is given the initial mesh before a part begins; `stop` says when to end. The seconds of the job count from
-    `begin`, as of `time.perf_counter`.
+    `check` is given the initial mesh before a part begins; `stop` says when to end, and so does the clock at `ends`, as
+    of `time.perf_counter`.
     """
-    job = plan.job
-    folder, request = work_folder(plan), _request(plan, source, sizes)
-    ends = None if job.max_seconds is None else begin + job.max_seconds
+    source, folder, request = task.source, work_folder(task.plan.job.output), _request(task)
     task_bytes = 0.0
 
     def is_over() -> bool:
@@ -244,18 +188,7 @@ def run_in_parts(
         started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
         started("parts")
-        most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
-        need = Need(n_parts, n_bytes, job.threads, is_within=True, most_bytes=most)
-        here = folder.absolute()  # workers that others started have folders of their own to begin with
-        folders = Folders(here, here / LOGS_NAME)
-        folders.logs.mkdir(exist_ok=True)
-        if job.scheduler is None and job.cluster is None:
-            _check_room(need, local_share(need, job.workers).bytes)  # with too little a worker does not even start
-        with workers(
-            need, folders, count=job.workers, scheduler=job.scheduler, cluster=job.cluster
-        ) as team:  # fmt: skip
-            note(team.words)
-            _check_room(need, team.bytes)
+        with _team(task.plan.job, folder, n_parts, n_bytes) as team:
 
             def run(names: Sequence[str]) -> Iterator[Any]:
                 return run_tasks(team, work_on, [str(Path(name).absolute()) for name in names], is_over=is_over)
@@ -265,8 +198,7 @@ def run_in_parts(
     started("parts")
     try:
         parted = mesh_in_parts(
-            request, folder, source.content.statistics if isinstance(source, StoredSource) else None,
-            volume=_volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0],
+            request, folder, source.content.statistics, volume=task.plan.left or source.contrasts[0],
             check=check, crew=crew, is_over=is_over,
             watch=lambda now, history: progress("", PartsProgress(now, history)),
         )  # fmt: skip
@@ -283,6 +215,22 @@ def run_in_parts(
     return parted, task_bytes
 
 
+@contextlib.contextmanager
+def _team(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iterator[Workers]:
+    """The workers that a job asks for, for so many parts of up to so many bytes; InputError for too little room."""
+    most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
+    need = Need(n_parts, n_bytes, job.threads, is_within=True, most_bytes=most)
+    here = folder.absolute()  # workers that others started have folders of their own to begin with
+    folders = Folders(here, here / LOGS_NAME)
+    folders.logs.mkdir(exist_ok=True)
+    if job.scheduler is None and job.cluster is None:
+        _check_room(need, local_share(need, job.workers).bytes)  # with too little a worker does not even start
+    with workers(need, folders, count=job.workers, scheduler=job.scheduler, cluster=job.cluster) as team:
+        note(team.words)
+        _check_room(need, team.bytes)
+        yield team
+
+
 def _check_room(need: Need, room: float) -> None:
     """InputError if a part needs more memory than a worker has for it."""
     if need.task_bytes > room:
@@ -293,29 +241,28 @@ def _check_room(need: Need, room: float) -> None:
         )
 
 
-def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> PartsRequest:
+def _request(task: Task) -> PartsRequest:
     """What is asked for, with a checksum of all on which the mesh depends."""
-    engine, nodes = plan.engine_options(), plan.job.nodes
-    assert nodes is not None, "filled in by `with_numbers`"
-    _check_number(plan.n_parts, nodes)
-    path = plan.job.images[0]
+    plan, sizes = task.plan, task.sizes
+    engine, nodes = plan.engine_options, task.size.n_nodes
     values: dict[str, Any] = {
-        "nodes": nodes, "n_parts": plan.n_parts, "k_D": engine["k_D"], "iterations": engine["iterations"],
-        "shape_power": engine["shape_power"], "min_dihedral": engine["min_dihedral"], "tolerance": 5e-4,
+        "nodes": nodes, "n_parts": plan.division.checked_number(nodes), "k_D": engine["k_D"],
+        "iterations": engine["iterations"], "shape_power": engine["shape_power"],
+        "min_dihedral": engine["min_dihedral"], "tolerance": 5e-4,
     }  # fmt: skip
-    image = stored_checksum(path) if isinstance(source, StoredSource) else source.about["image_sha256"]
+    of_image, place = identity(plan.left, task.source.about["image_sha256"])
     whole = {
-        **values, "image": image, "part": stated_part(plan.job), "tetopt": tetopt.__version__,
+        **values, "image": of_image, "part": stated_part(plan.job), "tetopt": tetopt.__version__,
         "sizes": None if sizes is None else [sizes.smallest, sizes.longest, sizes.gradation],
-        "place": str(path.resolve()) if isinstance(source, StoredSource) else None,
+        "place": place,
     }  # fmt: skip
     checksum = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
     return PartsRequest(**values, sizes=sizes, checksum=checksum)
 
 
-def end_work(plan: Plan, result: MeshingResult) -> None:
+def end_parts(mesh: Path, result: MeshingResult) -> None:
     """Remove the work directory of a run that is complete; say what becomes of that of another."""
-    folder = work_folder(plan)
+    folder = work_folder(mesh)
     if result.ended in ("iterations", "converged"):
         if left := removed(folder):
             warning(f"{folder}: stays with what is not tetopt's in it: {', '.join(left)}")

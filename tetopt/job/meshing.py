@@ -32,7 +32,8 @@ from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early
 from tetopt.job.options import SolverOptions, has_model
-from tetopt.job.source import Source
+from tetopt.job.plan import kind_of
+from tetopt.job.predict import stated_prediction
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.mesh import Mesh
@@ -46,12 +47,16 @@ START_WORDS = "making the initial mesh"
 
 def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     """The optimised mesh; `begin` is when the run began, as of `time.perf_counter`."""
-    if task.plan.n_parts is not None:
-        return _meshed_in_parts(task, stop, begin)
-    job, content = task.plan.job, task.source.content
-    assert isinstance(content, Content)
-    options = task.plan.engine_options()
-    ends = None if job.max_seconds is None else begin + job.max_seconds
+    seconds = task.plan.job.max_seconds
+    ends = None if seconds is None else begin + seconds
+    came = task.plan.division.chosen(_in_one_piece, _in_parts)(task, stop, begin, ends)
+    started("write")
+    return came
+
+
+def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
+    """In this process, all iterations in one round; towards an error, or of order 2, several runs in turn."""
+    job, content, options = task.plan.job, task.source.content, task.plan.engine_options
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
@@ -59,7 +64,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     def watch(initial: Mesh, run: Run) -> MeshingResult:
         if not begun:
             _check_early(task, initial, None)
-        check_space(job.output, CELL_BYTES * len(initial.cells))
+        _check_room(task, initial)
         begun.append(time.perf_counter())
         started("kernels", KERNEL_WORDS)
         note(_described(task, initial))
@@ -73,36 +78,39 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
             started("start", START_WORDS)
         return result
 
-    kind = task.plan.kind(content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
+    kind = kind_of(task.plan, content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
     started("start", START_WORDS)
     result = mesh_image(
         content, job.nodes, target_error=job.target_error, mode=task.plan.mode,
         start=None if task.started is None else task.started.mesh, spacing=job.spacing, kind=kind, sizes=task.sizes,
         order=job.order or 1, watch=watch, **options,
     )  # fmt: skip
-    started("write")
-    assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
-    predicted = max(before[0], before[1] + bytes_of(content, n_nodes))
-    return Meshed(result, result.initial, seconds, predicted, None)
+    n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))
+    predicted = {"prediction": stated_prediction(task.size), "memory": {"predicted_bytes": n_bytes}}
+    return Meshed(result, result.initial, seconds, predicted)
 
 
-def _meshed_in_parts(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
-    """The same in parts, which take the fields of their cells as well."""
+def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
+    """By workers, which take the fields of the cells as well."""
     loaded = time.perf_counter() - begin
 
     def check(initial: Mesh) -> None:
         early = {name: np.zeros(len(initial.cells)) for name in ("mean", "variance", "n_voxels", "min", "max")}
         _check_early(task, initial, early | cell_fields(initial))
-        check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
+        _check_room(task, initial)
 
-    parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, check, stop, begin)
-    assert parted.result.initial is not None
+    parted, n_bytes = run_in_parts(task, check, stop, ends)
     seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
     fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
-    started("write")
-    return Meshed(parted.result, parted.result.initial, seconds, n_bytes, fields)
+    predicted = {"prediction": {"task_bytes": n_bytes}}  # of each worker's largest task
+    return Meshed(parted.result, parted.result.initial, seconds, predicted, fields, is_kept=True)
+
+
+def _check_room(task: Task, initial: Mesh) -> None:
+    """InputError if the disk has no room for as many cells as the initial mesh has."""
+    check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
 
 
 def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
@@ -177,7 +185,6 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
 
 def _described(task: Task, initial: Mesh) -> str:
     source = task.source
-    assert isinstance(source, Source)
     image = source.contrasts[0]
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.content import SMOOTH_INTERFACES, Content, StoredContent, check_weights
+from tetopt.contents.content import SMOOTH_INTERFACES, Content, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
@@ -20,6 +20,8 @@ from tetopt.io.images import parse_crop, parse_slice
 from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
+from tetopt.parts.division import Division
+from tetopt.parts.work import VolumeFile
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
@@ -28,22 +30,38 @@ FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a squa
 
 
 class Plan(NamedTuple):
-    """A run without contradictions: options whose default does not depend on the image have their value."""
+    """A run without contradictions: options whose default does not depend on the image have their value.
+
+    Parameters
+    ----------
+    mode : {"graded", "uniform", "paper", "start"}
+        As of `mesh_image`.
+    job : JobOptions
+        The options, with defaults.
+    bare : JobOptions
+        As they came, without.
+    division : Division
+        In one piece, or in parts.
+    left : VolumeFile, optional
+        The image of a run in parts, if it is left in its file.
+    pictures : sequence of Path
+        To be drawn: slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail.
+
+    Examples
+    --------
+    >>> plan = tetopt.plan(tetopt.Job(images="brain.nii.gz", output="brain.vtu", nodes=5000))
+    >>> plan.mode, plan.job.k_D, plan.bare.k_D
+    ('graded', 0.85, None)
+    """
 
     mode: Mode
     job: JobOptions
-    bare: JobOptions  # as they came, without defaults
-    n_parts: int | None = None  # at least so many, if it is made in parts
-    pictures: Sequence[Path] = ()  # slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail
+    bare: JobOptions
+    division: Division = Division()
+    left: VolumeFile | None = None
+    pictures: Sequence[Path] = ()
 
-    def kind(self, ndim: int) -> str:
-        """What the initial mesh is: a kind of lattice, octree or start."""
-        if self.mode == "start":
-            return "start"
-        if self.mode == "graded":
-            return "octree"
-        return self.job.lattice or KINDS[ndim][0]
-
+    @property
     def engine_options(self) -> dict[str, Any]:
         """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
         job = self.job
@@ -52,36 +70,82 @@ class Plan(NamedTuple):
             return options | {"n_t": job.n_t, "retessellate": job.retessellate}
         return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
 
-    def stated(self, ndim: int) -> dict[str, Any]:
-        """The options as the mesh's file and run.json state them; files by their names."""
-        job = self.job
-        return {
-            "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
-            "lattice": self.kind(ndim), "size_min": job.size_min, "size_max": job.size_max,
-            "edge_max": job.edge_max, "gradation": job.gradation,
-            "sizing": None if job.sizing is None else job.sizing.name,
-            **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
-            "start": None if job.start is None else job.start.name, **self.engine_options(),
-        }  # fmt: skip
-
-    def with_job(self, **changes: Any) -> Plan:
-        """The same of other options."""
-        return self._replace(job=changed(self.job, **changes))
-
     def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
-        """The same of other images and other files, as many and of the same options."""
+        """The same of other images and other files, as many and of the same options.
+
+        Parameters
+        ----------
+        images : sequence of Path
+            Contrasts.
+        files : mapping of str to Path
+            The others, by the names of their options.
+
+        Returns
+        -------
+        Plan
+            Nothing is checked again.
+
+        Examples
+        --------
+        >>> plan = tetopt.plan(tetopt.Job(images="brain.nii.gz", output="brain.vtu"))
+        >>> [path.name for path in plan.with_files([Path("other.nii.gz")], {}).job.images]
+        ['other.nii.gz']
+        """
         return self._replace(
             job=changed(self.job, images=list(images), **files), bare=changed(self.bare, images=list(images), **files)
         )
 
 
-def planned(job: JobOptions) -> Plan:
-    """The run that a job asks for.
+def kind_of(plan: Plan, ndim: int) -> str:
+    """What the initial mesh is: a kind of lattice, octree or start."""
+    if plan.mode == "start":
+        return "start"
+    if plan.mode == "graded":
+        return "octree"
+    return plan.job.lattice or KINDS[ndim][0]
+
+
+def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
+    """The options as the mesh's file and run.json state them; files by their names."""
+    job = plan.job
+    return {
+        "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
+        "lattice": kind_of(plan, ndim), "size_min": job.size_min, "size_max": job.size_max,
+        "edge_max": job.edge_max, "gradation": job.gradation,
+        "sizing": None if job.sizing is None else job.sizing.name,
+        **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
+        "start": None if job.start is None else job.start.name, **plan.engine_options,
+        **plan.division.stated,
+    }  # fmt: skip
+
+
+def plan(job: JobOptions) -> Plan:
+    """The run that a job asks for, with the defaults that do not depend on the image; no voxel is read.
+
+    Parameters
+    ----------
+    job : Job
+        What is asked for.
+
+    Returns
+    -------
+    Plan
+        With the pictures to draw.
 
     Raises
     ------
     InputError
-        As `resolved`; an output that may not be written.
+        As `Job`; an output that may not be written.
+
+    See Also
+    --------
+    read : Reads the files, too, and fills in what depends on them.
+
+    Examples
+    --------
+    >>> plan = tetopt.plan(tetopt.Job(images="brain.nii.gz", output="brain.vtu", spacing=4))
+    >>> plan.mode, plan.job.iterations, plan.job.boundary
+    ('uniform', 20, 'slide')
     """
     checked_output(job.output, tuple(FORMATS), job.force)
     if job.json_path is not None:
@@ -220,7 +284,7 @@ def _pictures(job: JobOptions) -> list[Path]:
     return list(checked_outputs(results_folder(job.figures), names, job.force).values())
 
 
-def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, Sizes | None]:
+def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
     """The plan with the defaults that depend on the image, and the sizes.
 
     These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
@@ -232,7 +296,7 @@ def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, Si
         return plan, None
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
-        return plan.with_job(nodes=nodes), None
+        return plan._replace(job=changed(job, nodes=nodes)), None
     order, nodes, limits = job.order or 1, job.nodes, _limits(job)
     if not is_counted:
         nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
@@ -241,10 +305,10 @@ def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, Si
     if longest is None and nodes is not None:
         longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
         longest = longest if longest < np.inf else None
-    return plan.with_job(nodes=nodes, edge_max=longest), limits
+    return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits
 
 
-def _default_nodes(content: Content | StoredContent, limits: Sizes | None, many: float) -> int:
+def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
     """As many nodes as the targets take, where there are any, and elsewhere their share of the usual number.
 
     `many` are the nodes in all to a corner of cells.
@@ -252,7 +316,7 @@ def _default_nodes(content: Content | StoredContent, limits: Sizes | None, many:
     corners = float(
         np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
     )
-    if limits is not None and limits.has_target and isinstance(content, Content):
+    if limits is not None and limits.has_target:
         needed, share = nodes_of_sizes(content, limits)
         corners = needed + (1.0 - share) * corners
     return int(np.rint(many * corners))

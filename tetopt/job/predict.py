@@ -10,10 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, StoredContent
+from tetopt.contents.content import Content
 from tetopt.engine.cost import RunSize, predicted
 from tetopt.engine.meshing import QUADRATIC_NODES
-from tetopt.image import VoxelGrid
+from tetopt.image import Image
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
 from tetopt.io.zarr_images import is_zarr
 from tetopt.job.inputs import file_and_volume
@@ -25,9 +25,7 @@ QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly me
 SAMPLED_VALUES = 10_000  # of an image: one that is no whole number tells that most are none
 
 
-def size_of_run(
-    plan: Plan, content: Content | StoredContent, whole: VoxelGrid, n_started: int | None = None
-) -> RunSize:
+def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | None = None) -> RunSize:
     """The sizes of a run whose files have been read.
 
     Parameters
@@ -46,16 +44,13 @@ def size_of_run(
         per_block = 1 if plan.job.lattice == "five-tet" else 2
         nodes = max(round(per_block * content.volume / spacing**content.image.ndim), 1)
     size = _size(plan, whole.shape, nodes)
-    if isinstance(content, StoredContent):
-        elongation = _elongation(whole.spacing)
-        return size._replace(elongation=elongation, is_fractional=not content.statistics.is_whole)
     return size._replace(
-        n_voxels=content.image.data.size,
+        n_voxels=prod(content.image.shape),
         n_nodes=size.n_nodes if n_started is None else n_started,
-        n_channels=len(content.values) + (content.region is not None),
+        n_channels=content.n_channels + (content.region is not None),
         elongation=_elongation(content.image.spacing),
         has_memberships=content.memberships is not None,
-        is_fractional=content.is_plain and not np.array_equal(np.rint(some := _sample(content)), some),
+        is_fractional=content.is_plain and not _is_whole(content),
     )
 
 
@@ -95,9 +90,13 @@ def cropped_shape(plan: Plan, shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
 
 
-def _sample(content: Content) -> NDArray:
-    """Some of the image's voxels."""
-    return content.image.data.ravel()[:: max(content.image.data.size // SAMPLED_VALUES, 1)]
+def _is_whole(content: Content) -> bool:
+    """Whether the image has whole numbers: all of them if that is known, else some of its voxels."""
+    if content.statistics is not None:
+        return content.statistics.is_whole
+    data = content.image.data.ravel()
+    some = data[:: max(data.size // SAMPLED_VALUES, 1)]
+    return np.array_equal(np.rint(some), some)
 
 
 def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from tetopt.errors import InputError
@@ -12,10 +10,10 @@ from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.events import started, warning
-from tetopt.job.in_parts import is_left_stored, read_stored, with_parts
+from tetopt.job.in_parts import left_source, with_parts
 from tetopt.job.inputs import label_table, read_mesh, set_threads
 from tetopt.job.job import Job
-from tetopt.job.plan import Plan, changed, planned, with_numbers
+from tetopt.job.plan import Plan, changed, plan, with_numbers
 from tetopt.job.predict import size_of_run
 from tetopt.job.request import requested
 from tetopt.job.source import read_source
@@ -23,53 +21,61 @@ from tetopt.job.task import Task
 from tetopt.mesh import Mesh
 
 
-def task_of(job: Job) -> Task:
-    """What a job asks for, planned and read, with its threads set.
+def read(job: Job) -> Task:
+    """What a job asks for, planned and read, with its threads set: what `tetopt.run` begins with.
+
+    Parameters
+    ----------
+    job : Job
+        What is asked for.
+
+    Returns
+    -------
+    Task
+        The plan with its defaults, and the files beside one another. Nothing is written.
 
     Raises
     ------
     InputError
-        As `planned`, `with_parts` and `read`.
+        As `plan`; a file that cannot be read, or does not go with the others; options that parts do not have, where
+        the mesh is to be made in some.
+
+    See Also
+    --------
+    plan : The first half of it, which reads no voxels.
+    run : Goes on with it.
+
+    Examples
+    --------
+    >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
+    >>> task = tetopt.read(tetopt.Job(images="small.nii.gz", output="small.vtu"))
+    >>> task.source.content.n_voxels, task.size.n_nodes
+    (4096, 512)
     """
-    plan = planned(job)
+    checked = plan(job)
     set_threads(job.threads)
     started("read", "reading and preparing the image, with its mask and labels")
-    return read(with_parts(plan))
+    return _read(with_parts(checked))
 
 
-def read(plan: Plan) -> Task:
-    """The files that a plan names, and the defaults that depend on them.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, or does not go with the others.
-    """
-    if plan.n_parts is not None and is_left_stored(plan):
-        stored = read_stored(plan)
-        plan, sizes = with_numbers(plan, stored.content)
-        size = size_of_run(plan, stored.content, stored.content.image)
-        return Task(plan, stored, None, sizes, size, _request_of(plan))
-    source = read_source(plan.job, plan.job.label_names)
-    if plan.n_parts is not None and source.content.image.ndim != 3:
-        raise InputError("`parts`: of a volume, and the image is a plane; leave it out")
+def _read(plan: Plan) -> Task:
+    """The files that a plan names, and the defaults that depend on them."""
+    source = left_source(plan) or read_source(plan.job, plan.job.label_names)
+    plan.division.check_image(source.content.image)
     begun = None
     if plan.job.start is not None:
         begun = read_mesh(plan.job.start)
         _check_place(begun.mesh, source.contrasts[0], str(plan.job.start))
         if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
-            plan = plan.with_job(order=2)
+            plan = plan._replace(job=changed(plan.job, order=2))
         if source.labels is not None and not source.table.names:
             source = source.with_table(label_table(None, begun))
     plan, sizes = with_numbers(plan, source.content)
     n_started = None if begun is None else len(begun.mesh.points)
     size = size_of_run(plan, source.content, source.contrasts[0], n_started)
-    return Task(plan, source, begun, sizes, size, _request_of(plan))
-
-
-def _request_of(plan: Plan) -> dict[str, Any]:
-    """What decides the outputs, with the checksums of the files as they are now."""
-    return requested(changed(plan.bare, parts=plan.n_parts))
+    # With the checksums of the files as they are now.
+    request = requested(changed(plan.bare, parts=plan.division.n_parts))
+    return Task(plan, source, begun, sizes, size, request)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -12,10 +12,10 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
 from tetopt.job.events import Listener, listened, violated
-from tetopt.job.in_parts import end_work
+from tetopt.job.in_parts import end_parts
 from tetopt.job.job import Job
 from tetopt.job.meshing import meshed
-from tetopt.job.read import task_of
+from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
 from tetopt.measure.quality import quality
@@ -106,7 +106,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     """
     begin = time.perf_counter()
     with listened(on):
-        task = task_of(job)
+        task = read(job)
         came = meshed(task, stop or (lambda: False), begin)
         failed: dict[str, str] = {}
         model, about = saved(task, came, failed)
@@ -122,8 +122,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
             draw(task, came, model)
         result = Result(came.result.mesh, model, numbers, [], task, came, shapes, measured)
         result = result._replace(violated=_judged(result, failed))
-        if task.plan.n_parts is not None:
-            end_work(task.plan, came.result)
+        if came.is_kept:
+            end_parts(job.output, came.result)
         return result
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
-from tetopt.contents.content import SMOOTH_INTERFACES, Content, StoredContent, content, continued
+from tetopt.contents.content import SMOOTH_INTERFACES, Content, content, continued
 from tetopt.energy.sampling import cell_moments
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
@@ -35,11 +35,17 @@ class Source(NamedTuple):
     mask: Image | None
     about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
+    drawn: Image  # the first contrast as pictures show it: of one that is left in its file a coarser level
 
     @property
     def image(self) -> Image:
         """The first contrast on its own voxels; beyond a mask, around which alone they are kept, continued."""
         return continued(self.contrasts[0], self.content.continuation)
+
+    @property
+    def own(self) -> Content:
+        """That contrast by itself, on its own voxels; `content` may be on divided ones, and has more channels."""
+        return Content(self.image, statistics=self.content.statistics)
 
     @property
     def mask_word(self) -> str:
@@ -49,13 +55,13 @@ class Source(NamedTuple):
     @property
     def low(self) -> float:
         """The least intensity."""
-        return float(self.image.data.min())
+        return self.own.spread.low
 
     @property
     def is_constant(self) -> bool:
         """Whether what is meshed has one value everywhere."""
-        data = self.content.image.data
-        return bool(data.min() == data.max())
+        spread = self.content.spread
+        return spread.low == spread.high
 
     def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
         """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label.
@@ -131,12 +137,12 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "inputs": inputs,
         "box": box_text(box_of(image)),
     }
-    source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE)
+    source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
 
 
-def whose_variance(content: Content | StoredContent) -> str:
+def whose_variance(content: Content) -> str:
     """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
-    if isinstance(content, StoredContent) or (content.n_contrasts == 1 and len(content.values) == 1):
+    if content.n_contrasts == 1 and content.n_channels == 1:
         return "the image's variance"
     return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"

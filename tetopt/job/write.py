@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import peak_bytes
+from tetopt.contents.content import continued
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.io.files import TakenError
 from tetopt.job.events import note
-from tetopt.job.in_parts import StoredSource
 from tetopt.job.inputs import label_table
 from tetopt.job.model import (
     all_sets,
@@ -27,7 +27,7 @@ from tetopt.job.model import (
     with_chosen_sets,
 )
 from tetopt.job.options import SolverOptions
-from tetopt.job.predict import stated_prediction
+from tetopt.job.plan import stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
@@ -47,7 +47,6 @@ def model_with(
     """The mesh with all that the options say of it; `fields` of its cells are found, if they are not known."""
     source, started = task.source, task.started
     if fields is None:
-        assert isinstance(source, Source)
         fields = source.fields(mesh, labels)
     own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
     if started is not None and is_told:
@@ -62,23 +61,21 @@ def model_with(
         if "young" in started.cell_data or started.text("loads") is not None or has_results:
             note("moduli, loads and results of the mesh that is improved are not kept; give `young` and `loads`")
     known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
-    return solver_model(mesh, source.image, solver, fields, about, known_sets)
+    return solver_model(mesh, source.image.in_memory, solver, fields, about, known_sets)
 
 
 def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
     """Write the mesh, or keep it elsewhere; the model, and what files say about the run.
 
     Until its file is there, the mesh is kept beside it, as what the file has of each cell is measured before. What of
-    that could not be is left out, and noted in `failed`. A run in parts has its folder of work.
+    that could not be is left out, and noted in `failed`.
     """
     plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
-    options = plan.stated(source.content.image.ndim)
+    options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
-    if plan.n_parts is not None:
-        options["parts"] = plan.n_parts
     about = {**source.about, "options": options}
-    early = None if plan.n_parts is not None else keep_early(job.output, result.mesh, result.labels)
+    early = None if came.is_kept else keep_early(job.output, result.mesh, result.labels)
     if fields is None:
         fields = _measured_fields(source, result, failed)
     try:
@@ -102,11 +99,8 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
     return model, about
 
 
-def _measured_fields(
-    source: Source | StoredSource, result: MeshingResult, failed: dict[str, str]
-) -> dict[str, NDArray]:
+def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, str]) -> dict[str, NDArray]:
     """The fields of the result's cells; those of their shape and their labels alone, if the image's cannot be had."""
-    assert isinstance(source, Source)
     if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
         return dict(measured["fields"])
     return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
@@ -122,7 +116,7 @@ def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[st
     return measured | {name: value for name, value in counted.items() if value is not None}
 
 
-def _table_of(source: Source | StoredSource) -> LabelTable | None:
+def _table_of(source: Source) -> LabelTable | None:
     """Names and colours of the labels that are there."""
     if source.labels is None:
         return None
@@ -138,16 +132,10 @@ def numbers_of(
     table = _table_of(source)
     texts = about if table is None else about | {TABLE_TEXT: table_words(table)}
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
-    if isinstance(source, Source) and source.image is not source.content.image:
-        summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
+    summary["image_properties"] = image_summary(source.own)  # on its own voxels, not on divided ones
     summary["request"] = task.request
-    summary["memory"] = {"peak_bytes": peak_bytes()}
-    if task.plan.n_parts is None:
-        summary["prediction"] = stated_prediction(task.size)
-        summary["memory"] |= {"predicted_bytes": came.predicted_bytes}
-    else:  # of each worker's largest task
-        summary["prediction"] = {"task_bytes": came.predicted_bytes}
-    return summary
+    memory = {"peak_bytes": peak_bytes(), **came.predicted.get("memory", {})}
+    return summary | {"memory": memory, "prediction": came.predicted["prediction"]}
 
 
 def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
@@ -157,10 +145,9 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     has_image = "n_voxels" in fields
     if has_image:
         measures["cells_without_voxel"] = lambda: int((fields["n_voxels"] == 0).sum())
-    if has_image and isinstance(source, Source) and not (source.content.is_plain and source.content.region is None):
+    if has_image and not (source.content.is_plain and source.content.region is None):
         measures["contrasts"] = lambda: source.by_contrast(fields)
     if sizes is not None and sizes.has_target:
-        assert isinstance(source, Source), "no targets for the voxels of others"
         content, share = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
         measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
         measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * share)
@@ -176,13 +163,9 @@ def draw(task: Task, came: Meshed, model: Model) -> None:
     from tetopt.report import figures, thumbnail  # matplotlib is slow to load, and only needed here
 
     pictures, mesh, source = task.plan.pictures, came.result.mesh, task.source
-    if isinstance(source, StoredSource):
-        image = source.coarse()
-        figures.save_run_figures(pictures[:3], image, came.initial, came.result, task.start_name, image)
-        thumbnail.save_thumbnail(pictures[-1], image, mesh)
-        return
-    image = source.contrasts[0]
-    figures.save_run_figures(pictures[:3], source.image, came.initial, came.result, task.start_name, image)
+    image = source.drawn
+    own = continued(image, source.content.continuation)
+    figures.save_run_figures(pictures[:3], own, came.initial, came.result, task.start_name, image)
     of_cell = model.cell_data.get("label")
     if source.mask is not None:
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])

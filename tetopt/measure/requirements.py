@@ -51,7 +51,7 @@ def judged(
     """
     E_D, n_voxels = content_E_D(content, mesh)
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
-    result = promised(MeshingResult(mesh, [row], "iterations", labels=labels), content, min_dihedral, mesh)
+    result = promised(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
     result = requested(result, content, target_error, is_filled)
     beyond = float(beyond_box(mesh, content.image).max())
     if (is_filled or content.region is not None) and beyond > ON_SIDE_VOXELS:

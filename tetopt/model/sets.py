@@ -19,7 +19,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
 from tetopt.geometry.simplex import outward_facet_nodes
 from tetopt.geometry.topology import facets, largest_component
-from tetopt.image import VoxelGrid, transformed
+from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
 BOUNDARY_SET = "boundary"  # every facet of one cell only
@@ -505,6 +505,6 @@ def box_text(box: Box) -> dict[str, Any]:
     return {"shape": list(box.shape), "affine": box.affine.tolist()}
 
 
-def box_of(image: VoxelGrid) -> Box:
+def box_of(image: Image) -> Box:
     """The box that an image fills."""
     return Box(image.shape, image.affine)

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.statistics import Statistics, stored_statistics
+from tetopt.contents.content import Content
+from tetopt.contents.statistics import Statistics, statistics
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
 from tetopt.engine.fast import EXCHANGING_SHARE
@@ -26,7 +27,7 @@ from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.promises import promised_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
 from tetopt.parts.part import Kind, Numbers, PartSettings, box_of_ticks, work_on
@@ -48,7 +49,6 @@ from tetopt.parts.work import (
 )
 from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
-from tetopt.stored import StoredImage
 
 MOST_CELLS = 100_000  # of a part: 17,000 nodes, of which a tenth to a fifth are shared, and some seconds of a round
 MOST_VOXELS = 2**25  # of the cells of a part, 34 million: with its sums below 1.5 GB
@@ -93,7 +93,7 @@ class Parted(NamedTuple):
     fields: dict[str, NDArray]  # of each cell what the image is there: n_voxels, mean, variance, min, max
     part: NDArray[np.int64]  # (M,) of each cell, rising
     statistics: Statistics  # of the image
-    image: StoredImage
+    image: Image
 
 
 def in_turn(names: Sequence[str]) -> Iterator[Any]:
@@ -103,7 +103,7 @@ def in_turn(names: Sequence[str]) -> Iterator[Any]:
 
 
 def mesh_in_parts(
-    request: PartsRequest, folder: Path, statistics: Statistics | None = None, *,
+    request: PartsRequest, folder: Path, known: Statistics | None = None, *,
     volume: VolumeFile | Image | None = None,
     crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
     is_over: Callable[[], bool] = lambda: False,
@@ -118,8 +118,8 @@ def mesh_in_parts(
     folder : Path
         Of work. All that is done stays in it, so that the same request goes on where it ended, whatever ended it;
         unless it is refused before a part begins.
-    statistics : Statistics, optional
-        Of the image, if they are known.
+    known : Statistics, optional
+        Of the image, if a pass over it has taken them.
     volume : VolumeFile or Image, optional
         The image, unless `tetopt.parts.work.save_volume` has noted in the folder where its voxels are.
     crew : callable
@@ -148,7 +148,7 @@ def mesh_in_parts(
         if state is None and volume is not None:  # what a run that got no further has noted may be of another image
             save_volume(folder, volume)
         image = open_volume(folder)
-        state = state or _begun(request, folder, image, statistics)
+        state = state or _begun(request, folder, image, known)
         run = _Run(request, folder, image, time.perf_counter() - state.known["seconds"], is_over, watch)
         check(_initial(run, state))
         counts = _counts(run, state)
@@ -171,7 +171,7 @@ def mesh_in_parts(
 class _Run(NamedTuple):
     request: PartsRequest
     folder: Path
-    image: StoredImage
+    image: Image
     begin: float
     is_over: Callable[[], bool]
     watch: Callable[[Round, list[IterationRecord]], None]
@@ -182,21 +182,21 @@ def _n_rounds(request: PartsRequest) -> int:
     return ceil(request.iterations / ROUND_SWEEPS)
 
 
-def _begun(request: PartsRequest, folder: Path, image: StoredImage, statistics: Statistics | None) -> WorkState:
+def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics | None) -> WorkState:
     """The state before the first round: the octree, on the grid of ticks."""
     begin = time.perf_counter()
-    statistics = stored_statistics(image) if statistics is None else statistics
-    mesh = octree_mesh(image, request.nodes, request.sizes, statistics)
+    of_image = statistics(image) if known is None else known
+    mesh = octree_mesh(Content(image, statistics=of_image), request.nodes, request.sizes)
     bits = grid_bits(image, mesh.points)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
     settings = PartSettings(
         request.k_D, request.shape_power, request.min_dihedral, request.tolerance,
         _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_SHARE * request.iterations) if request.k_D > 0.0 else 0,
-        sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, statistics.noise,
+        sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, of_image.noise,
     )  # fmt: skip
-    known = {"settings": settings._asdict(), "statistics": statistics._asdict(), "history": []}
-    state = WorkState(request.checksum, 0, known | {"seconds": time.perf_counter() - begin})
+    noted = {"settings": settings._asdict(), "statistics": of_image._asdict(), "history": []}
+    state = WorkState(request.checksum, 0, noted | {"seconds": time.perf_counter() - begin})
     arrays = {"ticks": ticks, "cells": mesh.cells}
     save_arrays(folder / INITIAL_NAME, arrays, {})
     save_state(folder, state, arrays)
@@ -237,7 +237,7 @@ def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
     return counts_of(max(run.request.n_parts, fewest), tuple(run.image.spacing * run.image.shape))
 
 
-def expected_parts(grid: VoxelGrid, request_nodes: int, n_parts: int) -> tuple[int, float]:
+def expected_parts(grid: Image, request_nodes: int, n_parts: int) -> tuple[int, float]:
     """About how many parts a round will have, and the bytes that one takes, before there is a mesh."""
     n_cells, n_voxels = CELLS_PER_NODE[3] * request_nodes, prod(grid.shape)
     fewest = ceil(n_cells / MOST_CELLS + n_voxels / MOST_VOXELS)
@@ -258,10 +258,11 @@ def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner,
     number = state.n_rounds
     kind: Kind = "measure" if number == 0 else "improve"
     parts = _cut(run, state, counts, ROUND_SHIFTS[max(number - 1, 0) % len(ROUND_SHIFTS)])
-    done = _ran(run, state, parts, kind, runner, task_bytes)
-    if done is None:
+    paths = _prepared(run, state, parts, kind)
+    now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0, task_bytes)
+    if not _is_run(run, state, now, parts, paths, runner):
         return None
-    arrays, numbers = zip(*done, strict=True)
+    arrays, numbers = zip(*(load_arrays(done_path(path)) for path in paths), strict=True)
     mesh = joined([each["ticks"] for each in arrays], [each["cells"] for each in arrays])
     return _completed(run, state, mesh, [Numbers(**each) for each in numbers])
 
@@ -291,10 +292,8 @@ def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]
     return after
 
 
-def _ran(
-    run: _Run, state: WorkState, parts: list[Piece], kind: Kind, runner: Runner, task_bytes: float
-) -> list[tuple[dict[str, NDArray], dict[str, Any]]] | None:
-    """What came of each part, in their order; None if the run was cut short before all were done."""
+def _prepared(run: _Run, state: WorkState, parts: list[Piece], kind: Kind) -> list[Path]:
+    """The files that say what is to be made of each part, in their order."""
     folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
     folder.mkdir(exist_ok=True)
     n_nodes = 1 + max(int(piece.nodes[-1]) for piece in parts)
@@ -305,9 +304,13 @@ def _ran(
         nodes = round(len(piece.ticks) * run.request.nodes / n_nodes) if kind == "improve" else len(piece.ticks)
         text = {"kind": kind, "settings": _settings(state)._asdict(), "iterations": iterations, "nodes": nodes}
         save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
+    return paths
+
+
+def _is_run(run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: list[Path], runner: Runner) -> bool:
+    """Run the parts; False if they were cut short before all were done."""
     # The largest first, as it is last to end.
     order = sorted(range(len(parts)), key=lambda at: (-len(parts[at].cells), at))
-    now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0, task_bytes)
     run.watch(now, _history(state))
     n_done = 0
     for n_done, _ in enumerate(runner([str(paths[at]) for at in order]), 1):
@@ -315,9 +318,7 @@ def _ran(
         if n_done < len(parts) and run.is_over():
             break
     # By their number and not by their files, which may be those of a run that was stopped here and took its fields.
-    if n_done < len(parts):
-        return None
-    return [load_arrays(done_path(path)) for path in paths]
+    return n_done == len(parts)
 
 
 def _is_converged(request: PartsRequest, state: WorkState) -> bool:
@@ -337,13 +338,14 @@ def _finished(
         raise InputError(f"{run.folder}: ended before the first round was complete; run this again to go on with it")
     parts = _cut(run, state, counts, ROUND_SHIFTS[0])
     whole = run._replace(is_over=lambda: False)
-    done = _ran(whole, state, parts, "fields", runner, task_bytes)
-    if done is None:  # the runner knows of the end as well, and may have begun no more parts
-        done = _ran(whole, state, parts, "fields", in_turn, task_bytes)
-    assert done is not None, "nothing cuts it short"
+    paths = _prepared(run, state, parts, "fields")
+    now = Round(state.n_rounds, _n_rounds(run.request) + 2, "fields", len(parts), 0, task_bytes)
+    if not _is_run(whole, state, now, parts, paths, runner):  # it knows of the end as well, and begins no more parts
+        _is_run(whole, state, now, parts, paths, in_turn)
+    done = [load_arrays(done_path(path))[0] for path in paths]
     mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])
     scale = 2.0 ** -_settings(state).bits
-    fields = {name: np.concatenate([each[name] for each, _ in done]) for name in done[0][0]}
+    fields = {name: np.concatenate([each[name] for each in done]) for name in done[0]}
     result = MeshingResult(
         Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells), history, ended,
         initial=_initial(run, state), nodes=run.request.nodes,

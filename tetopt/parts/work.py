@@ -32,10 +32,9 @@ from tetopt.image import Image
 from tetopt.incoming import json_of, own_bytes
 from tetopt.io.files import save_json, written_whole
 from tetopt.io.images import Bounds
-from tetopt.io.stored_images import open_stored
+from tetopt.io.stored_images import open_stored, stored_checksum
 from tetopt.io.text import plain
 from tetopt.io.work_directory import LOCK_NAME, Layout, create, discard, opened
-from tetopt.stored import StoredImage
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
 LOGS_NAME = "logs"
@@ -61,7 +60,7 @@ class VolumeFile(NamedTuple):
     volume: int | None = None  # which of several, as of `tetopt.io.stored_images.open_stored`
     crop: Bounds | None = None  # likewise
 
-    def opened(self) -> StoredImage:
+    def opened(self) -> Image:
         """The image; InputError as `open_stored`."""
         with warnings.catch_warnings():  # which were said when the image was first opened
             warnings.simplefilter("ignore")
@@ -110,6 +109,13 @@ def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
         raise
 
 
+def identity(file: VolumeFile | None, sha256: str) -> tuple[str, str | None]:
+    """What shows that an image is the same one, and where it is if it is left in its file, which is not read here."""
+    if file is None:
+        return sha256, None
+    return stored_checksum(file.path), str(file.path.resolve())
+
+
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
     """Note where the voxels are, or leave those of an image in memory in the folder, from where they are mapped."""
     create(folder, LAYOUT)
@@ -122,14 +128,14 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
     save_json(folder / VOLUME_NAME, words)
 
 
-def open_volume(folder: Path) -> StoredImage:
+def open_volume(folder: Path) -> Image:
     """The image whose voxels a work directory is about; InputError as `open_stored`, or the folder is damaged."""
     path = folder / VOLUME_NAME
     try:
         words = json_of(own_bytes(path).decode())
         if words["path"] is None:
             path = folder / VOXELS_NAME
-            return StoredImage(np.load(path, mmap_mode="r"), words["affine"])
+            return Image.stored(np.load(path, mmap_mode="r"), words["affine"])
         crop = None if words["crop"] is None else [tuple(each) for each in words["crop"]]
         volume = VolumeFile(Path(words["path"]), words["volume"], crop)
     except DAMAGE_ERRORS as error:

@@ -13,11 +13,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, StoredContent, plain
+from tetopt.contents.content import Content, plain
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import Quality, quality
@@ -41,14 +41,9 @@ def mesh_hash(mesh: Mesh) -> str:
     return digest.hexdigest()
 
 
-def image_summary(image: Image | StoredContent) -> dict[str, Any]:
+def image_summary(image: Image | Content) -> dict[str, Any]:
     """Shape, place and spread of an image; `total_variation` is E_D of one cell around everything."""
-    grid: VoxelGrid
-    if isinstance(image, StoredContent):
-        grid, (mean, low, high, variance, *_) = image.image, image.statistics
-    else:
-        grid, low, high = image, float(image.data.min()), float(image.data.max())
-        mean, variance = float(image.data.mean(dtype=np.float64)), float(np.var(image.data, dtype=np.float64))
+    grid, (mean, low, high, variance) = plain(image).image, plain(image).spread
     return {
         "shape": grid.shape,
         "spacing_mm": grid.spacing,
@@ -62,7 +57,7 @@ def image_summary(image: Image | StoredContent) -> dict[str, Any]:
 
 
 def run_summary(
-    image: Image | Content | StoredContent, initial: Mesh, result: MeshingResult, about: dict[str, Any],
+    image: Image | Content, initial: Mesh, result: MeshingResult, about: dict[str, Any],
     seconds: dict[str, float], shapes: tuple[Quality | None, Quality | None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.
@@ -72,13 +67,13 @@ def run_summary(
     if shapes is None:
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
     first, last = result.history[0], result.history[-1]
-    content = image if isinstance(image, StoredContent) else plain(image)
+    content = plain(image)
     spread = content.variance * content.volume
     return {
         **about,
         "versions": versions(),
         "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
-        "image_properties": image_summary(content if isinstance(content, StoredContent) else content.image),
+        "image_properties": image_summary(content),
         "ended": result.ended,
         "iterations_done": last.iteration,
         "energies": {

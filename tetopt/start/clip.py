@@ -62,14 +62,12 @@ def lattice_within(
     if region is None or nodes is None:
         mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
         return mesh if region is None else clipped(mesh, image, region)
-    in_box, best = nodes * region.inside.size / region.inside.sum(), None  # nodes of a lattice of the whole box
+    in_box, meshes = nodes * region.inside.size / region.inside.sum(), []  # nodes of a lattice of the whole box
     for _ in range(LATTICE_TRIALS):
         mesh = clipped(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
-        if best is None or abs(len(mesh.points) - nodes) < abs(len(best.points) - nodes):
-            best = mesh
+        meshes.append(mesh)
         in_box *= nodes / len(mesh.points)
-    assert best is not None
-    return best
+    return min(meshes, key=lambda mesh: abs(len(mesh.points) - nodes))
 
 
 def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
 from tetopt.contents.content import Content, plain
-from tetopt.contents.statistics import READ_BYTES, Statistics
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
 from tetopt.start.delaunay import delaunay, without_flat
@@ -42,8 +41,7 @@ from tetopt.start.sizes import (
     Sizes,
     equilateral_nodes,
 )
-from tetopt.start.sums import BlockSums, Channels, VoxelSource, block_starts, block_sums, channels_of, halved, source_of
-from tetopt.stored import StoredImage
+from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
 ROOT_SHARES = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
@@ -76,25 +74,22 @@ TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 o
 FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
 
 
-def octree_mesh(
-    image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
-) -> Mesh:
+def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """A graded mesh of the image's box, or of the mask's region.
 
     Blocks of voxels are divided where that lowers E_D most, and cut into cells that conform; see `tetopt.start.octree`.
 
     Parameters
     ----------
-    image : Image, Content or StoredImage
+    image : Image or Content
         Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly; or, with a mask, its region up to the
         surface, on which nodes are put. A stored image is read box by box, once, and once for each of the sizes of
         undivided blocks that are tried, up to eleven; the mesh is that of the same voxels in memory, to the last bit.
+        A `Content` that has their `statistics` is read once less.
     nodes : int
         Number of nodes to come near to. The nearest octree has a few per cent more or less, of few a few dozen.
     sizes : Sizes, optional
         Targets and limits for the blocks' edges. Targets take voxels in memory.
-    statistics : Statistics, optional
-        Of a stored image, where they are known (`stored_statistics`), so that it is read once less.
 
     Returns
     -------
@@ -120,23 +115,23 @@ def octree_mesh(
     >>> numbers.n_nodes, round(numbers.max_edge / numbers.min_edge, 1)
     (303, 3.3)
     """
-    source = source_of(image, statistics)
-    shape = " x ".join(map(str, source.grid.shape))
+    content = plain(image)
+    shape = " x ".join(map(str, content.image.shape))
     given_sizes = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
-    limits = _block_limits(source, nodes, sizes)
-    fewest, by_target = _fewest_nodes(source, limits), _target_nodes(source, limits)
+    limits = _block_limits(content, nodes, sizes)
+    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
     if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
-        if limits.target is None and enough <= prod(source.grid.shape):  # the bound is low: the coarsest octree tells
-            enough = len(_octree_within(source, nodes, limits).points)
+        if limits.target is None and enough <= prod(content.image.shape):  # the bound is low: the coarsest octree tells
+            enough = len(_octree_within(content, nodes, limits).points)
         raise InputError(
             f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
             f"ask for {np.ceil(enough):.0f}, or allow longer edges"
         )
-    mesh = _octree_within(source, nodes, limits)
+    mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
     # Exchanges take care of the rest.
-    if is_near(count, nodes) or source.inside is not None or limits.target is not None:
+    if is_near(count, nodes) or content.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
@@ -153,9 +148,9 @@ class _BlockLimits(NamedTuple):
     n_rings: int  # blocks of a divided block's size around it, in every direction
 
 
-def _block_limits(source: VoxelSource, nodes: int, sizes: Sizes | None) -> _BlockLimits:
+def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLimits:
     """The limits that the number of nodes and the sizes set; InputError where they cannot be kept."""
-    image = source.grid
+    image = content.image
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
@@ -169,14 +164,13 @@ def _block_limits(source: VoxelSource, nodes: int, sizes: Sizes | None) -> _Bloc
     if sizes.smallest > longest_side:
         raise InputError(f"smallest: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
-    largest = max(sizes.longest_edge(image, nodes, source.volume) / LONGEST_IN_BLOCK[n], smallest)
+    largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
     target = None
     if sizes.has_target:
-        if not isinstance(image, Image):
-            raise InputError(
-                "sizes: largest and field are for each voxel of an image in memory, and this one is stored; "
-                "use smallest, longest, coarsest and gradation, or crop it"
-            )
+        check_in_memory(
+            image, "sizes: largest and field are for each voxel",
+            "use smallest, longest, coarsest and gradation, or crop it",
+        )  # fmt: skip
         target = _target(image, sizes)
     return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
@@ -212,21 +206,20 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
     return enough, float(np.mean(has_one if inside is None else has_one[inside]))
 
 
-def _fewest_nodes(source: VoxelSource, limits: _BlockLimits) -> float:
+def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
     """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
     with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
-        return float(2.0 * source.volume / np.float64(limits.largest) ** source.grid.ndim)
+        return float(2.0 * content.volume / np.float64(limits.largest) ** content.image.ndim)
 
 
-def _target_nodes(source: VoxelSource, limits: _BlockLimits) -> float:
+def _target_nodes(content: Content, limits: _BlockLimits) -> float:
     """The nodes of equilateral cells of the targets, where there are any."""
     if limits.target is None:
         return 0.0
-    assert isinstance(source.grid, Image)
-    return equilateral_nodes(limits.target, source.grid, source.inside)
+    return equilateral_nodes(limits.target, content.image, content.inside)
 
 
-def _check_not_below_voxels(image: VoxelGrid, nodes: float) -> None:
+def _check_not_below_voxels(image: Image, nodes: float) -> None:
     """InputError if there are more nodes than voxels."""
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         raise InputError(
@@ -239,45 +232,40 @@ def is_near(count: int, nodes: int) -> bool:
     return abs(count - nodes) <= max(LARGEST_MISS * nodes, LARGEST_MISS_NODES)
 
 
-def nearest_octree(
-    image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
-) -> Mesh:
+def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """As `octree_mesh`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
-    source = source_of(image, statistics)
-    return _octree_within(source, nodes, _block_limits(source, nodes, sizes))
+    content = plain(image)
+    return _octree_within(content, nodes, _block_limits(content, nodes, sizes))
 
 
-def _octree_within(source: VoxelSource, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree within the limits that has most nearly so many nodes, cut off at the mask's surface."""
-    region = None if source.content is None else source.content.region
-    if source.content is None or region is None:
-        return _octree_of_box(source, nodes, limits)
+    image, region = content.image, content.region
+    if region is None:
+        return _octree_of_box(content, nodes, limits)
     # The surface takes away nodes and adds others; how many is known only afterwards.
-    image = source.content.image
-    best, in_box, fewest = None, nodes, 2**image.ndim + 1
+    meshes, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
         try:
-            mesh = clipped(_octree_of_box(source, in_box, limits), image, region)
+            mesh = clipped(_octree_of_box(content, in_box, limits), image, region)
         except InputError:  # the region is thinner than the cells
-            if best is None and trial == MASK_TRIALS - 1:
+            if not meshes and trial == MASK_TRIALS - 1:
                 raise
             in_box *= 2
             continue
         count = len(mesh.points)
-        if best is None or abs(count - nodes) < abs(len(best.points) - nodes):
-            best = mesh
+        meshes.append(mesh)
         if abs(count - nodes) <= TRIAL_MISS * nodes:
             break
         in_box = int(np.clip(in_box * nodes / count, max(fewest, in_box / 2), 2 * in_box))
-    assert best is not None
-    return best
+    return min(meshes, key=lambda mesh: abs(len(mesh.points) - nodes))
 
 
-def _octree_of_box(source: VoxelSource, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree of the whole box that has most nearly so many nodes."""
-    image = source.grid
-    _check_not_below_voxels(image, max(_fewest_nodes(source, limits), _target_nodes(source, limits)))
-    roots, divided = _best_division(source, nodes, limits)
+    image = content.image
+    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
+    roots, divided = _best_division(content, nodes, limits)
     index = _leaf_nodes(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -303,21 +291,21 @@ class _Blocks(NamedTuple):
 
 
 def _blocks_by_depth(
-    source: VoxelSource, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
+    content: Content, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
 ) -> list[_Blocks]:  # fmt: skip
     """The blocks of each depth, the coarsest first, with their errors and whether they exceed the limits."""
-    image = source.grid
+    image = content.image
     edge = image.spacing * image.shape / np.array(roots)
     depth, n_by_content = _depths(edge, roots, image.spacing, limits)
     # Errors say whether a block is divided: those of the smallest are not needed, but which of them a mask has.
-    summed = depth if source.inside is not None else max(n_by_content - 1, 0)
+    summed = depth if content.inside is not None else max(n_by_content - 1, 0)
     n_blocks, n_summed = (float(prod(roots)) * 2.0 ** (image.ndim * d) for d in (depth, summed))
-    n_fields = len(channels.means) + 1 + (source.inside is not None) + OTHER_FIELDS
+    n_fields = len(channels.means) + 1 + (content.inside is not None) + OTHER_FIELDS
     need = BLOCK_FIELD_BYTES * (n_summed * n_fields + n_blocks * (limits.target is not None))
-    need += 2.0 * READ_BYTES * (source.stored is not None)
+    need += content.image.box_bytes
     check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
-    sums = block_sums(source, channels, np.array(roots) << summed)
-    spread = SPREAD_OF_VARIANCE * float(sums.second.sum() / source.n_voxels) + SPREAD_OF_NOISE * channels.noise
+    sums = block_sums(content, channels, np.array(roots) << summed)
+    spread = SPREAD_OF_VARIANCE * float(sums.second.sum() / content.n_voxels) + SPREAD_OF_NOISE * channels.noise
     target = None if limits.target is None else _least_targets(limits.target, np.array(roots) << depth)
     blocks = []
     for d in range(depth, -1, -1):
@@ -434,7 +422,7 @@ def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
 
 
 def _best_division(
-    source: VoxelSource, nodes: int, limits: _BlockLimits
+    content: Content, nodes: int, limits: _BlockLimits
 ) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Numbers of roots along each axis, and which blocks are divided, of the octree with most nearly so many nodes.
 
@@ -442,14 +430,14 @@ def _best_division(
     undivided blocks: then others are tried, at last the lattice that has the number by itself.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
-    image, channels = source.grid, channels_of(source)
+    image, channels = content.image, channels_of(content)
     for roots in _root_counts(image, nodes, limits):
         if (np.array(image.shape) / roots).max() < LEAF_VOXELS and best is not None:
             break
         edge = image.spacing * image.shape / np.array(roots)
         if _is_too_large(edge, _depths(edge, roots, image.spacing, limits)[0], limits):
             continue
-        blocks = _blocks_by_depth(source, channels, roots, limits)
+        blocks = _blocks_by_depth(content, channels, roots, limits)
         count, divided = _division(blocks, roots, nodes, limits.n_rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
@@ -464,7 +452,7 @@ def _best_division(
     return best[1:]
 
 
-def _root_counts(image: VoxelGrid, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
+def _root_counts(image: Image, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
     """Numbers of roots along each axis to try, within the limits: the largest blocks first."""
     largest, smallest = limits.largest, limits.smallest
     lengths = image.spacing * image.shape

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Image
 from tetopt.kernel_cache import njit
 from tetopt.start.lattice import near_cubes
 
@@ -143,12 +143,12 @@ class Sizes(NamedTuple):
             raise InputError("field: no voxel is above 0; give lengths in mm")
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
-    def longest_edge(self, image: VoxelGrid, nodes: int, volume: float | None = None) -> float:
+    def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
         """The longest edge that any cell may have, mm.
 
         Parameters
         ----------
-        image : VoxelGrid
+        image : Image
             Whose box the mesh covers.
         nodes : int
             Number of nodes of the mesh.

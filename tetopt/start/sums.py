@@ -8,59 +8,18 @@ their blocks in their order: the sums are the same bits however the volume is cu
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, plain
+from tetopt.contents.content import Content
 from tetopt.contents.noise import NoiseSample, noise_sample, sampled_noise
-from tetopt.contents.statistics import (
-    Box,
-    Statistics,
-    mean_of,
-    pieces,
-    row_sums,
-    slabs,
-    stored_boxes,
-    stored_statistics,
-)
+from tetopt.contents.statistics import mean_of, row_sums, statistics
 from tetopt.errors import InputError
-from tetopt.image import Image, VoxelGrid
+from tetopt.image import Box, pieces
 from tetopt.kernel_cache import njit
-from tetopt.stored import StoredImage
-
-
-class VoxelSource(NamedTuple):
-    """Where voxels come from; made by `source_of`. There is either a content or a stored image."""
-
-    grid: VoxelGrid
-    content: Content | None
-    stored: StoredImage | None
-    statistics: Statistics | None  # of the stored image, if they are known
-
-    @property
-    def n_voxels(self) -> int:
-        """Voxels to be covered."""
-        return int(np.prod(self.grid.shape, dtype=np.int64)) if self.content is None else self.content.n_voxels
-
-    @property
-    def volume(self) -> float:
-        """What they fill, mm^n."""
-        return self.n_voxels * self.grid.voxel_volume
-
-    @property
-    def inside(self) -> NDArray[np.bool_] | None:
-        """Which voxels are to be covered, if not all."""
-        return None if self.content is None or self.content.region is None else self.content.region.inside
-
-
-def source_of(image: Image | Content | StoredImage, statistics: Statistics | None = None) -> VoxelSource:
-    """What an octree is made of; nothing is read yet."""
-    if isinstance(image, StoredImage):
-        return VoxelSource(image, None, image, statistics)
-    content = plain(image)
-    return VoxelSource(content.image, content, None, None)
 
 
 class Channels(NamedTuple):
@@ -80,34 +39,28 @@ class Channels(NamedTuple):
         return deviations
 
 
-def channels_of(source: VoxelSource) -> Channels:
-    """The channels of a source, from one pass over its voxels where their statistics are not known.
+def channels_of(content: Content) -> Channels:
+    """The channels of a content, from one pass over its voxels where their statistics are not known.
 
     Raises
     ------
     InputError
         Deviations whose squares overflow; of a stored image voxels that no `Image` takes.
     """
-    content = source.content
-    if content is None:
-        assert source.stored is not None
-        known = stored_statistics(source.stored) if source.statistics is None else source.statistics
-        _check_squares(known.scale, source.n_voxels)
+    if content.is_plain and content.region is None and content.image.ndim == 3:
+        known = statistics(content.image) if content.statistics is None else content.statistics
+        _check_squares(known.scale, content.n_voxels)
         return Channels([known.mean], known.scale, known.scaled_noise, 0.0)
-    means, scale, size = [], 0.0, content.image.data.size
-    for values in _in_3d(content.values):
-        sums = np.empty(values.shape[:2])
-        for slab in slabs(values.shape):
-            for piece in pieces(values[slab].shape):
-                rows = slice(slab[0].start + piece[0].start, slab[0].start + piece[0].stop), piece[1]
-                sums[rows] = row_sums(np.array(values[slab][piece], dtype=np.float64, order="C"))
-        means.append(mean_of(sums, size))
+    means, scale, size = [], 0.0, prod(content.image.shape)
+    for values in content.values if content.image.ndim == 3 else content.values[:, None]:
+        sums = [row_sums(np.array(plane, dtype=np.float64, order="C")) for plane in values]
+        means.append(mean_of(np.stack(sums), size))
         scale = max(scale, *(abs(float(end) - means[-1]) for end in (values.min(), values.max())))
     _check_squares(scale, size)
     scale = scale or 1.0
     result = Channels(means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2)
     # The noise is that of values at most 1, too: its estimate rounds differently otherwise.
-    within = None if source.inside is None else noise_sample(source.inside)
+    within = None if content.inside is None else noise_sample(content.inside)
     noise = 0.0
     for channel, values in enumerate(content.values[: content.n_contrasts]):
         sample = noise_sample(values)
@@ -164,9 +117,9 @@ def block_starts(size: int, count: int) -> NDArray[np.int64]:
     return np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
 
 
-def block_sums(source: VoxelSource, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
+def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
     """Sums over so many equal blocks along each axis, from one pass over the voxels."""
-    shape = source.grid.shape
+    shape = content.image.shape
     starts = [block_starts(size, count) for size, count in zip(shape, counts, strict=True)]
     lengths = [np.diff(start, append=size).astype(np.float64) for start, size in zip(starts, shape, strict=True)]
     starts = [np.zeros(1, dtype=np.int64)] * (3 - len(shape)) + starts
@@ -174,10 +127,10 @@ def block_sums(source: VoxelSource, channels: Channels, counts: NDArray[np.int64
     of_plane, of_row = (
         np.repeat(np.arange(len(length)), length.astype(np.int64)) for length in [np.ones(1), *lengths][-3:-1]
     )
-    n_fields = 1 + len(channels.means) + (source.inside is not None)
+    n_fields = 1 + len(channels.means) + (content.inside is not None)
     totals = np.zeros((n_fields, *(len(start) for start in starts)))
     of_open = np.empty(0)  # sums of a block that goes on in the next box of the same planes
-    for box, values, inside in _boxes_of(source):
+    for box, values, inside in _boxes_of(content):
         first, last = of_row[box[1].start], of_row[box[1].stop - 1]
         sums = np.zeros((n_fields, values.shape[1], last - first + 1, len(starts[2])))
         if box[1].start > 0 and of_row[box[1].start - 1] == first:
@@ -192,26 +145,20 @@ def block_sums(source: VoxelSource, channels: Channels, counts: NDArray[np.int64
         for plane, block in enumerate(of_plane[box[0]]):
             totals[:, block, first : first + n_done] += sums[:, plane, :n_done]
     totals = totals.reshape(n_fields, *counts)
-    inside, firsts = None if source.inside is None else totals[-1], list(totals[1 : 1 + len(channels.means)])
+    inside, firsts = None if content.inside is None else totals[-1], list(totals[1 : 1 + len(channels.means)])
     return BlockSums(lengths, inside, totals[0], firsts)
 
 
-def _boxes_of(source: VoxelSource) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
+def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
     """Boxes of whole rows, plane after plane: their voxels, (C, P, R, K), and which are inside, (P, R, K)."""
-    if source.stored is not None:
-        for box in stored_boxes(source.stored):
-            yield box, source.stored.read([s.start for s in box], [s.stop for s in box])[None], None
-        return
-    assert source.content is not None
-    values = _in_3d(source.content.values)
-    inside = None if source.inside is None else _in_3d(source.inside[None])[0]
-    for box in slabs(values.shape[1:]):
-        yield box, values[:, *box], None if inside is None else inside[box]
-
-
-def _in_3d(values: NDArray) -> NDArray:
-    """Channels of 2-D images, (C, R, K), with an axis of one plane."""
-    return values if values.ndim == 4 else values[:, None]
+    image, channels, inside = content.image, content.channels, content.inside
+    for box in image.boxes():
+        own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)
+        if channels is None:
+            values = image.read([each.start for each in own], [each.stop for each in own])
+        else:
+            values = channels[:, *own]
+        yield box, values.reshape(-1, *shape), None if inside is None else inside[own].reshape(shape)
 
 
 def _fields(
