@@ -55,6 +55,7 @@ RIGHT = {
     "quality": {"points": MESH.points, "cells": MESH.cells},
     "read_frd": {"path": "a.frd", "mesh": MESH},
     "run": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
+    "run_cohort": {"subjects": "t.tsv", "output": "out"},
     "save_image": {"path": "a.nii", "image": IMAGE},
     "save_mesh": {"path": "a.vtu", "mesh": MESH, "cell_data": {}, "order": 1},
     "save_model": {"path": "a.inp", "model": MODEL, "space": "ras"},

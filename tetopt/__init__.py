@@ -4,60 +4,16 @@ __version__ = "0.1.0"
 
 from importlib import import_module
 from inspect import isfunction
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from typing import Any
 
 from tetopt.cache import place_cache
 
 place_cache()  # before numba is loaded
 
-if TYPE_CHECKING:
-    from tetopt.check import check_mesh
-    from tetopt.contents.align import foreground_mask, resample_contrast, resample_labels, resample_mask
-    from tetopt.contents.content import Content, content
-    from tetopt.contents.statistics import Statistics
-    from tetopt.energy.discretization import E_D
-    from tetopt.energy.geometric import E_G
-    from tetopt.energy.sampling import CellMoments, cell_moments, cell_of_voxel
-    from tetopt.engine.fast import optimize
-    from tetopt.engine.loop import IterationRecord, MeshingResult
-    from tetopt.engine.meshing import mesh_image
-    from tetopt.engine.paper import optimize_paper
-    from tetopt.errors import InputError
-    from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solve
-    from tetopt.geometry.surface import Surface, extract_surface
-    from tetopt.image import Image, VoxelGrid
-    from tetopt.io.formats import save_mesh, save_model
-    from tetopt.io.frd import Results, read_frd
-    from tetopt.io.images import load_image, save_image
-    from tetopt.io.label_tables import load_label_table
-    from tetopt.io.meshes import load_mesh
-    from tetopt.io.stored_images import open_stored
-    from tetopt.io.surfaces import save_surface
-    from tetopt.job.events import Event
-    from tetopt.job.job import Job
-    from tetopt.job.run import Result, run
-    from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
-    from tetopt.measure.interfaces import LabelInterface, label_interfaces
-    from tetopt.measure.quality import Quality, QualityErrors, quality
-    from tetopt.measure.segmentation import segment
-    from tetopt.mesh import Mesh
-    from tetopt.model.build import build_model
-    from tetopt.model.fields import cell_fields
-    from tetopt.model.file import MeshFile
-    from tetopt.model.labels import LabelTable
-    from tetopt.model.laws import ByLabel
-    from tetopt.model.loads import Load
-    from tetopt.model.materials import BinningError, Materials
-    from tetopt.model.model import Model
-    from tetopt.model.sets import Box, Sets
-    from tetopt.phantom import Phantom, Shape, load_phantom
-    from tetopt.start.lattice import lattice_mesh
-    from tetopt.start.octree import octree_mesh
-    from tetopt.start.sizes import Sizes
-    from tetopt.stored import StoredImage
-
 _NAMES_OF = {  # by module
     "check": ("check_mesh",),
+    "cohort.cohort": ("run_cohort",),
     "contents.align": ("resample_contrast", "resample_labels", "resample_mask", "foreground_mask"),
     "contents.content": ("Content", "content"),
     "contents.statistics": ("Statistics",),
@@ -102,80 +58,7 @@ _NAMES_OF = {  # by module
     "start.sizes": ("Sizes",),
     "stored": ("StoredImage",),
 }
-__all__ = [
-    "E_D",
-    "E_G",
-    "BinningError",
-    "Box",
-    "ByLabel",
-    "CellMoments",
-    "Content",
-    "Event",
-    "Image",
-    "InputError",
-    "IterationRecord",
-    "Job",
-    "LabelFidelity",
-    "LabelInterface",
-    "LabelTable",
-    "Load",
-    "MaskFidelity",
-    "Materials",
-    "Mesh",
-    "MeshFile",
-    "MeshingResult",
-    "Model",
-    "Phantom",
-    "Quality",
-    "QualityErrors",
-    "Result",
-    "Results",
-    "Sets",
-    "Shape",
-    "Sizes",
-    "Solution",
-    "SolutionFields",
-    "Statistics",
-    "StoredImage",
-    "Surface",
-    "VoxelGrid",
-    "__version__",
-    "build_model",
-    "cell_fields",
-    "cell_labels",
-    "cell_moments",
-    "cell_of_voxel",
-    "check_mesh",
-    "content",
-    "extract_surface",
-    "foreground_mask",
-    "label_fidelity",
-    "label_interfaces",
-    "lattice_mesh",
-    "load_image",
-    "load_label_table",
-    "load_mesh",
-    "load_phantom",
-    "mask_fidelity",
-    "mesh_image",
-    "octree_mesh",
-    "open_stored",
-    "optimize",
-    "optimize_paper",
-    "quality",
-    "read_frd",
-    "resample_contrast",
-    "resample_labels",
-    "resample_mask",
-    "run",
-    "save_image",
-    "save_mesh",
-    "save_model",
-    "save_surface",
-    "segment",
-    "solution_fields",
-    "solve",
-]
+__all__ = sorted(["__version__", *chain(*_NAMES_OF.values())])
 
 
 def __getattr__(name: str) -> Any:

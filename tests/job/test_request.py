@@ -9,10 +9,11 @@ from commands import exit_code, mesh_words, numbers_in
 
 import tetopt
 from tetopt import InputError, Job
-from tetopt.cli.options import from_records, option_words, with_options
+from tetopt.cli.options import from_records
 from tetopt.io.images import sha256
 from tetopt.job.options import RunOptions, given_options
 from tetopt.job.request import checksum, requested
+from tetopt.job.texts import option_words, with_options
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
@@ -114,7 +115,8 @@ def test_options_of_a_row_replace_those_of_all():
 
 @pytest.mark.parametrize(("texts", "words"), [
     ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "nodes: .1e3. is no value of it"),
-    ({"nonlinear": "maybe"}, "expected true or false"),
+    ({"nonlinear": "maybe"}, "expected true or false"), ({"iterations": "-1"}, "iterations: .-1. is no value of it"),
+    ({"method": "Fast"}, "method: .Fast. is no"), ({"nodes": "9" * 20, "k-d": "x"}, "no value of it; k-d: .x. is no"),
     ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
 ])  # fmt: skip
 def test_options_of_a_row_that_cannot_be(texts, words):
