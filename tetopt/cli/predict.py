@@ -41,10 +41,9 @@ def _seconds(value: float) -> str:
 def print_parts(task: Task) -> None:
     """Say how many parts there will be, and what each takes."""
     job = task.plan.job
-    assert job.nodes is not None, "filled in by `with_numbers`"
     number, n_bytes = parts_of(task.plan, task.source.contrasts[0])
     need = Need(number, n_bytes, job.threads, is_within=True)
-    own = OCTREE_NODE_BYTES * job.nodes
+    own = OCTREE_NODE_BYTES * task.size.n_nodes
     out.print(
         f"about {counted(number, 'part')} in a round, each of up to {memory_words(n_bytes)} of memory, a worker "
         f"{memory_words(need.limit_for(n_bytes))} in all; about {memory_words(own)} for this command, whose octree is "

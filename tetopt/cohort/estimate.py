@@ -17,11 +17,9 @@ from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.images import file_shape
 from tetopt.job.events import listened
-from tetopt.job.inputs import read_mesh
 from tetopt.job.options import SizeOptions
-from tetopt.job.plan import with_numbers
-from tetopt.job.predict import size_by_headers, size_of_run
-from tetopt.job.source import read_source
+from tetopt.job.predict import size_by_headers
+from tetopt.job.read import read
 
 LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
 
@@ -72,13 +70,9 @@ def _read_size(entry: PlannedSubject) -> RunSize | None:
     """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
     try:
         with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
-            source = read_source(entry.job, entry.job.label_names)
-            plan, _ = with_numbers(entry.plan, source.content)
-            begun = plan.job.start
-            n_started = None if begun is None else len(read_mesh(begun).mesh.points)
+            return read(entry.plan).size
     except (InputError, OSError):
         return None
-    return size_of_run(plan, source.content, source.contrasts[0], n_started)
 
 
 def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
