@@ -106,7 +106,7 @@ def test_run_json_states_the_request(tmp_path):
 def test_options_of_a_row_replace_those_of_all():
     """Of values that may be repeated all are the row's; a switch can be off; what is not named stays."""
     options = RunOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
-    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70", "crop": "1:9,:,:", "average": "voigt"}
+    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70.0", "crop": "1:9,:,:", "average": "voigt"}
     own = with_options(options, texts)
     assert given_options(own) == {
         "crop": "1:9,:,:", "nodes": 70, "average": "voigt", "set": ["A=below:1", "B=below:2"], "units": "MPa",

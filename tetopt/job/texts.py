@@ -63,6 +63,8 @@ def _value_of(name: str, kind: Any, option: Option, text: str) -> Any:
         return text.lower() in ("1", "true", "yes")
     if get_origin(own) is list:
         return [part.strip() for part in text.split(";") if part.strip()] or None
+    if own is int:
+        text = re.sub(r"\.0+$", "", text)  # as spreadsheets write whole numbers
     value: Any = text if get_origin(own) is Literal else own(text)
     least = -LARGEST_INTEGER if option.least is None else option.least
     is_choice = get_origin(own) is not Literal or value in get_args(own)
