@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -218,7 +219,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         callback(rows[1])
         return MeshingResult(LATTICE, rows, "iterations", LATTICE)
 
-    with cli_run.Display(lambda: None) as display, listened(display):
+    with closing(cli_run.Display(lambda: None)) as display, listened(display):
         started("kernels")
         prepare(make)
         lines.clear()
@@ -244,7 +245,7 @@ def test_commands_hear_how_compiling_goes(command, monkeypatch, capsys):
     monkeypatch.setattr(fast if command == "mesh" else warm_up, "link", link)
 
     def mesh():
-        with cli_run.Display(lambda: None) as display, listened(display):
+        with closing(cli_run.Display(lambda: None)) as display, listened(display):
             started("kernels")
             prepare(lambda say: fast.prepare_kernels(plain(IMAGE), 0.5, is_graded=True, progress=say))
 

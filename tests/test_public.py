@@ -58,6 +58,7 @@ RIGHT = {
     "register_format": {"suffix": ".a", "write": str, "what": "a", "runs": True},
     "read": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
     "run": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
+    "run_cohort": {"subjects": "t.tsv", "output": "out"},
     "save_image": {"path": "a.nii", "image": IMAGE},
     "save_mesh": {"path": "a.vtu", "mesh": MESH, "cell_data": {}, "order": 1},
     "save_model": {"path": "a.inp", "model": MODEL, "space": "ras"},

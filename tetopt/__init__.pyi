@@ -1,6 +1,7 @@
 """The public names of tetopt, and the modules that they are loaded from."""
 
 from .check import check_mesh as check_mesh
+from .cohort.cohort import run_cohort as run_cohort
 from .contents.align import (
     foreground_mask as foreground_mask,
     resample_contrast as resample_contrast,

@@ -20,7 +20,7 @@ from typer.models import ArgumentInfo
 
 from tetopt import bids
 from tetopt.cli import main
-from tetopt.cli.app import COMMANDS, loaded_command
+from tetopt.cli.app import COMMANDS, help_line, loaded_command
 
 BIDS = "bids"  # the page of what containers run
 HELP = "--help"  # said once, on the page of all commands
@@ -190,7 +190,7 @@ def _panels(name: str) -> list[str]:
 
 def summary(name: str) -> str:
     """A command in one line."""
-    return COMMANDS[name][1] if name in COMMANDS else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
+    return help_line(name) if name in COMMANDS else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
 
 
 class CommandsDirective(SphinxDirective):

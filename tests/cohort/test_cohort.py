@@ -17,11 +17,13 @@ from cohorts import save_run
 from commands import exit_code
 
 import tetopt
-from tetopt.cli import cohort as cohort_module
-from tetopt.cli import cohort_plan
-from tetopt.cli.cohort import Estimate
-from tetopt.cli.options import CohortOptions
+from tetopt import InputError
+from tetopt.cohort import cohort as cohort_module
+from tetopt.cohort import estimate as estimate_module
+from tetopt.cohort import plan as cohort_plan
+from tetopt.cohort.estimate import Estimate
 from tetopt.cohort.layout import begin, description, locked
+from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
@@ -251,7 +253,7 @@ def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
     (small / "law.csv").write_text("intensity,young\n0,1\n100,5\n")
     monkeypatch.chdir(small)
     options = RunOptions(young="law.csv")
-    (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu", print)
+    (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu")
     assert entry.words() == ("--nodes=60", f"--young={small / 'law.csv'}", "--", str(small / "a.nii.gz"))
 
 
@@ -289,7 +291,7 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
         (small / name).write_bytes(b"1")
     options = RunOptions(mask=Path("m{subject}.nii"), sizing=Path("s{subject}.nii"), threads=2)
     (small / "t.tsv").write_text("subject\timage\tmask\n1\ta.nii.gz\t\n2\ta.nii.gz\ts1.nii\n")
-    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu", print)
+    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu")
     assert [each.plan.job.sizing for each in (first, second)] == [small / "s1.nii", small / "s2.nii"]
     assert [each.plan.job.mask for each in (first, second)] == [small / "m1.nii", small / "s1.nii"]
     assert second.words() == (
@@ -361,10 +363,10 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
 
 def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
     """It does not begin here; jobs of a batch system may still have that memory."""
-    monkeypatch.setattr(cohort_module, "available_bytes", lambda: 8e9)
+    monkeypatch.setattr(estimate_module, "available_bytes", lambda: 8e9)
     estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)})
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
-    assert [cohort_module._need(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
+    assert [estimate_module.need_of(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
 
 
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
@@ -391,6 +393,20 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
     monkeypatch.setattr(cohort_module, "locked", locked)
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
     monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}))
-    monkeypatch.setattr(cohort_module, "_run", lambda to_run, *_: keys.extend(entry.key for entry in to_run))
+    monkeypatch.setattr(cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run))
     exit_code("cohort", small / "t.tsv", "-o", small / "out")
     assert keys == ["sub-02"]
+
+
+def test_a_cohort_from_python_is_that_of_the_command(small):
+    """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
+    rows = tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, count=1, iterations=1)
+    assert rows == {"sub-01": "done", "sub-02": "done"}
+    assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--iterations", "1", "--dry-run") == 0
+    events = []
+    tetopt.run_cohort(small / "t.tsv", str(small / "out"), on=events.append, iterations=1, dry_run=True)
+    assert events[-1] == ("note", "2 subjects: 2 done; 0 to run", None)
+    with pytest.raises(InputError, match="has no option 'noodes'; is nodes meant"):
+        tetopt.run_cohort(small / "t.tsv", small / "out", noodes=3)
+    with pytest.raises(InputError, match=r"^`nodes`: expected a whole number, got 'many'"):
+        tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")

@@ -9,7 +9,7 @@ from attacks import content, outside, planted
 from cohorts import run_of, save_run, thumbnail
 from commands import assert_refused, exit_code
 
-from tetopt.cli import cohort_plan
+from tetopt.cohort import plan as cohort_plan
 from tetopt.cohort.layout import begin, description, log_path, numbers_path, publish, restore, thumbnail_path
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files

@@ -49,7 +49,7 @@ class Running(NamedTuple):
 
 def load_everything() -> None:
     """Import what any command imports, and link all kernels, without starting a thread that a fork would lose."""
-    modules = [f"tetopt.cli.{module}" for module, _ in app.COMMANDS.values()]
+    modules = [f"tetopt.cli.{module}" for module in app.COMMANDS.values()]
     modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
     modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
     modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py", "zarr", "zarr.codecs"]

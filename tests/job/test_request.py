@@ -9,10 +9,11 @@ from commands import exit_code, mesh_words, numbers_in
 
 import tetopt
 from tetopt import InputError, Job
-from tetopt.cli.options import from_records, option_words, with_options
+from tetopt.cli.options import from_records
 from tetopt.io.images import sha256
 from tetopt.job.options import RunOptions, given_options
 from tetopt.job.request import checksum, requested
+from tetopt.job.texts import option_words, with_options
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
@@ -105,7 +106,7 @@ def test_run_json_states_the_request(tmp_path):
 def test_options_of_a_row_replace_those_of_all():
     """Of values that may be repeated all are the row's; a switch can be off; what is not named stays."""
     options = RunOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
-    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70", "crop": "1:9,:,:", "average": "voigt"}
+    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70.0", "crop": "1:9,:,:", "average": "voigt"}
     own = with_options(options, texts)
     assert given_options(own) == {
         "crop": "1:9,:,:", "nodes": 70, "average": "voigt", "set": ["A=below:1", "B=below:2"], "units": "MPa",
@@ -114,7 +115,8 @@ def test_options_of_a_row_replace_those_of_all():
 
 @pytest.mark.parametrize(("texts", "words"), [
     ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "nodes: .1e3. is no value of it"),
-    ({"nonlinear": "maybe"}, "expected true or false"),
+    ({"nonlinear": "maybe"}, "expected true or false"), ({"iterations": "-1"}, "iterations: .-1. is no value of it"),
+    ({"method": "Fast"}, "method: .Fast. is no"), ({"nodes": "9" * 20, "k-d": "x"}, "no value of it; k-d: .x. is no"),
     ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
 ])  # fmt: skip
 def test_options_of_a_row_that_cannot_be(texts, words):

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -23,53 +24,22 @@ from tetopt.interpreter import THREADS_NAME
 from tetopt.io.files import Outputs, outputs_of_command
 from tetopt.job.events import listened
 
-# In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
-# the command's help. It is here as well so that `tetopt --help` takes no second: only the command that runs is loaded.
+# In the order of the help, with the modules that have NAME_command: only that of the command that runs is loaded.
 COMMANDS = {
-    "mesh": (
-        "mesh",
-        "Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU.",
-    ),
-    "cohort": (
-        "cohort",
-        "Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended.",
-    ),
-    "quality": ("quality", "Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."),
-    "convert": (
-        "convert",
-        "Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix.",
-    ),
-    "surface": (
-        "surface",
-        "Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area.",
-    ),
-    "view": (
-        "view",
-        "Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in the browser.",
-    ),
-    "phantom": ("phantom", "Write a phantom as an image: known shapes, known intensities."),
-    "fem": ("fem", "Solve a mesh with its loads: displacements, stresses, strain energy, reactions."),
-    "segment": (
-        "segment",
-        "Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels.",
-    ),
-    "paper": (
-        "compare",
-        "Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours.",
-    ),
-    "baseline": (
-        "compare",
-        "Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise.",
-    ),
-    "compare": (
-        "compare",
-        "Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time.",
-    ),
-    "warm-up": (
-        "warm_up",
-        "Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache.",
-    ),
-    "demo": ("mesh", "Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."),
+    "mesh": "mesh",
+    "cohort": "cohort",
+    "quality": "quality",
+    "convert": "convert",
+    "surface": "surface",
+    "view": "view",
+    "phantom": "phantom",
+    "fem": "fem",
+    "segment": "segment",
+    "paper": "compare",
+    "baseline": "compare",
+    "compare": "compare",
+    "warm-up": "warm_up",
+    "demo": "mesh",
 }
 
 
@@ -178,12 +148,18 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
     )
     app.callback()(_common)
     chosen = next((word for word in arguments if not word.startswith("-")), None)  # no option before it takes a value
-    for name, (_, text) in COMMANDS.items():
+    for name in COMMANDS:
         if name == chosen:
             app.command(name, cls=_Command)(loaded_command(name))
         else:
-            app.command(name, help=text)(lambda: None)
+            app.command(name, help=help_line(name))(lambda: None)
     return app
+
+
+def help_line(name: str) -> str:
+    """Return the first line of a command's docstring, from the text of its module, which takes a second to load."""
+    source = Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
+    return source.partition(f"def {name.replace('-', '_')}_command(")[2].split('"""')[1].splitlines()[0]
 
 
 def loaded_command(name: str) -> Callable[..., Any]:
@@ -203,7 +179,7 @@ def loaded_command(name: str) -> Callable[..., Any]:
         )
     from tetopt.cli.options import from_records  # which loads what its defaults come from
 
-    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name.replace('-', '_')}_command"))
+    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command"))
 
 
 def _version(is_requested: bool) -> None:

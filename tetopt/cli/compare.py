@@ -24,12 +24,12 @@ from tetopt.cli.options import (
     NumberOptions,
     option,
 )
-from tetopt.cli.quality import image_fit
 from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.inputs import checked_outputs, label_table, read_labels, read_volume
 from tetopt.job.options import DEFAULT_NODES, WHOLE_BOX, BoxPart
+from tetopt.measure.fidelity import image_fit
 from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields

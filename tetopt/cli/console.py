@@ -32,11 +32,7 @@ PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls
     "smallest": "--size-min", "largest": "--size-max", "longest": "--edge-max", "field": "--sizing",
 }  # fmt: skip
 PARAMETER_PATTERN = re.compile(rf"^(?:{'|'.join(PARAMETER_OPTIONS)})(?=:)")
-# Arguments that messages name, of options that no job has.
-OTHER_ARGUMENTS = (
-    "field", "html", "image", "participant_label", "pipeline", "reference_dofs", "screenshot", "session_label",
-    "suffix",
-)  # fmt: skip
+OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments that messages name
 
 
 class _Stream:
@@ -147,8 +143,7 @@ def with_hyphens(message: str) -> str:
         return message
     from tetopt.job.options import JobOptions, kinds_of, option_name
 
-    names = {name: f"--{name.replace('_', '-')}" for name in OTHER_ARGUMENTS}
-    names |= {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()}
+    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()} | OPTION_NAMES
     return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
 
 

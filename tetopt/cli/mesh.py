@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +28,7 @@ from tetopt.report.tables import add_quality, new_table, nodes_in_words
 
 def mesh_command(job: Job, predict: PredictOption = False) -> int:
     """Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU."""
-    with mesh_kept() as begin_keeping, Display(begin_keeping) as display:
+    with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         if predict:
             return _predict(job, display)
         result = run(job, display, display.is_over)

@@ -2,32 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.markup import escape
 
-from tetopt import InputError
-from tetopt.cli.console import log, out, show_error, show_warning
-from tetopt.cli.options import MeshArgument, NumberOptions, SurfacePart, option
-from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
-from tetopt.geometry.simplex import volumes
-from tetopt.geometry.surface import Surface, extract_surface
-from tetopt.geometry.topology import facets, largest_component
+from tetopt.cli.console import out
+from tetopt.cli.options import MeshArgument, NumberOptions, option
 from tetopt.io.files import checked_output, save_json
-from tetopt.io.surfaces import LABELLED_SUFFIXES, SURFACE_SUFFIXES, SurfaceCheck, checked_surface, save_surface
-from tetopt.job.inputs import cell_field, label_table, read_mesh
-from tetopt.measure.fidelity import FacetSurface, surface_areas
-from tetopt.model.file import MeshFile
-from tetopt.model.labels import label_words, labels_named
-from tetopt.model.model import SPACES
-from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
+from tetopt.io.surfaces import SURFACE_SUFFIXES
+from tetopt.job.surface import SurfacePart, write_surface
 from tetopt.report.tables import new_table
-
-MOST_LISTED = 12  # interfaces in the table; all are in the file of numbers
 
 
 def surface_command(
@@ -40,172 +25,13 @@ def surface_command(
     """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area."""
     output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
     json_path = numbers.checked()
-    _check_part(part, output)
-    loaded = read_mesh(mesh_path)
-    if loaded.mesh.ndim != 3:
-        raise InputError(f"{mesh_path}: expected tetrahedra, whose boundary is a surface, found triangles")
-    names = label_table(part.label_names, loaded).names
-    if part.interfaces or part.interface is not None:
-        report = _write_interfaces(loaded, mesh_path, output, part, names)
-    else:
-        report = _write_closed(loaded, mesh_path, output, part, names)
+    written = write_surface(mesh_path, output, part)
+    table = new_table(*map(escape, written.heads))
+    for row in written.rows:
+        table.add_row(*map(escape, row))
+    out.print(table)
+    for line in written.lines:
+        out.print(line)
     if json_path is not None:
-        save_json(json_path, {"mesh": mesh_path.name, "surface": output.name} | report)
-    return 0 if report.get("is_watertight", True) else 1
-
-
-def _check_part(part: SurfacePart, output: Path) -> None:
-    """InputError unless one surface is asked for, and one that the file can hold."""
-    chosen = [part.below is not None, part.label is not None, part.cell_set is not None, part.interface is not None]
-    if sum([*chosen, part.boundary or part.interfaces]) != 1:
-        raise InputError(
-            "surface: give one of --below, --label, --set, --boundary, --interface and --interfaces (which takes the "
-            "boundary, too, with --boundary)"
-        )
-    if part.interfaces and output.suffix.lower() not in LABELLED_SUFFIXES:
-        raise InputError(
-            f"{output}: STL cannot tell which labels a triangle lies between; take {' or '.join(LABELLED_SUFFIXES)}"
-        )
-    if part.space not in SPACES:
-        raise InputError(f"--space: expected {' or '.join(SPACES)}, got {part.space}")
-
-
-def _write_closed(
-    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
-) -> dict[str, Any]:
-    """The boundary of a structure, or of the whole mesh: written, read back and printed."""
-    if part.label is not None:
-        chosen = _with_label(loaded, path, labels_named(part.label, names), names)
-    else:
-        chosen = _chosen(loaded, path, part)
-    surface = extract_surface(loaded.mesh.points, loaded.mesh.cells, chosen)
-    save_surface(output, surface, path.name, part.space)
-    written = checked_surface(output)
-    table = new_table("", escape(output.name))
-    table.add_row("cells", str(len(chosen)))
-    table.add_row("triangles", str(len(surface.triangles)))
-    table.add_row("closed surfaces", str(written.n_pieces))
-    table.add_row("volume, mm3", f"{written.volume:.6g}")
-    table.add_row("of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}")
-    table.add_row("area, mm2", f"{written.area:.6g}")
-    if surface.n_parted:
-        log.print(
-            f"{surface.n_parted} nodes and edges where the structure touches itself were parted, by "
-            f"{surface.largest_shift:.2g} mm at most, so that each edge is in two triangles"
-        )
-    out.print(table)
-    is_sound = written.is_watertight and written.is_winding_consistent and written.volume > 0.0
-    if is_sound:
-        out.print("checked with trimesh: watertight, normals out")
-    else:
-        show_error(f"{output}: not watertight, by trimesh; please report this")
-    measured = {"volume_mm3": written.volume, "area_mm2": written.area, "n_pieces": written.n_pieces}
-    parted = {"n_parted": surface.n_parted, "largest_shift_mm": surface.largest_shift}
-    return {"is_watertight": is_sound} | measured | parted
-
-
-def _write_interfaces(
-    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
-) -> dict[str, Any]:
-    """The facets between labels as they are in the mesh, out of the smaller one: written, read back and printed."""
-    labels = cell_field(loaded, path, "label").astype(np.int64)
-    every = label_surfaces(facets(loaded.mesh.cells), labels)
-    sides = every.label, every.beyond
-    if part.interface is not None:
-        one, other = _two_sides(part.interface, names)
-        rows = np.flatnonzero(np.isin(sides[0], one) & np.isin(sides[1], other))
-        if len(rows) == 0:
-            words = " and ".join(" or ".join(label_words(k, names) for k in side) for side in (one, other))
-            raise InputError(f"{path}: no facet lies between labels {words}")
-    else:
-        is_outer = (sides[1] == OUTSIDE_LABEL) & part.boundary
-        rows = np.flatnonzero((sides[0] != OUTSIDE_LABEL) & ((sides[0] < sides[1]) | is_outer))
-        if len(rows) == 0:
-            raise InputError(f"{path}: all cells have one label, which has no interfaces; --boundary is all around")
-    shown = LabelSurfaces(*(each[rows] for each in every))
-    of_triangle = {"label_inside": shown.label, "label_outside": shown.beyond}
-    used, triangles = np.unique(shown.nodes, return_inverse=True)
-    surface = Surface(loaded.mesh.points[used], triangles.reshape(-1, 3), 0, 0.0)
-    is_labelled = output.suffix.lower() in LABELLED_SUFFIXES
-    save_surface(output, surface, path.name, part.space, of_triangle if is_labelled else None)
-    return _print_interfaces(output, surface, shown, names, checked_surface(output))
-
-
-def _print_interfaces(
-    output: Path, surface: Surface, shown: LabelSurfaces, names: dict[int, str], written: SurfaceCheck
-) -> dict[str, Any]:
-    """Area and triangles of each pair of labels, and the numbers for the file of numbers."""
-    areas = surface_areas(FacetSurface(surface.points, surface.triangles))
-    # Of all triangles together, whatever their labels: at a rim one of them ends, at a seam three or more meet.
-    together = LabelSurfaces(np.zeros_like(shown.label), shown.beyond, shown.nodes)
-    n_facets = surface_ridges(together).n_facets
-    pairs, which, counts = np.unique(
-        np.column_stack([shown.label, shown.beyond]), axis=0, return_inverse=True, return_counts=True
-    )
-    of_pair = np.bincount(which.ravel(), areas)
-    table = new_table(escape(output.name), "triangles", "area, mm2")
-    for k in np.argsort(-of_pair, kind="stable")[:MOST_LISTED]:
-        inside, beyond = pairs[k].tolist()
-        words = "outside" if beyond == OUTSIDE_LABEL else label_words(beyond, names)
-        table.add_row(escape(f"{label_words(inside, names)} to {words}"), str(counts[k]), f"{of_pair[k]:.6g}")
-    if len(pairs) > 1:
-        table.add_row(f"all {len(pairs)}", str(len(areas)), f"{areas.sum():.6g}")
-    out.print(table)
-    out.print(
-        f"edges in one triangle: {int((n_facets == 1).sum())}, in more than two: {int((n_facets > 2).sum())}; read "
-        f"back: {written.area:.6g} mm2"
-    )
-    rows = [
-        {"label_inside": pairs[k, 0], "label_outside": pairs[k, 1], "n_triangles": counts[k], "area_mm2": of_pair[k]}
-        for k in range(len(pairs))
-    ]
-    edges = {"n_rim_edges": int((n_facets == 1).sum()), "n_seam_edges": int((n_facets > 2).sum())}
-    return {"area_mm2": written.area, "n_triangles": len(areas), **edges, "interfaces": rows}
-
-
-def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
-    """The labels on both sides of the interface that "J,K" means."""
-    sides = text.split(",")
-    if len(sides) != 2:
-        raise InputError(f'--interface: expected two labels as J,K, by number or name, got "{text}"')
-    one, other = labels_named(sides[0], names), labels_named(sides[1], names)
-    if set(one) & set(other):
-        raise InputError(f'--interface: expected two different labels, got "{text}"')
-    return one, other
-
-
-def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> NDArray[np.int64]:
-    """Numbers of the cells of these labels."""
-    labels = cell_field(loaded, path, "label")
-    cells = np.flatnonzero(np.isin(labels, chosen))
-    if len(cells) == 0:
-        known = ", ".join(label_words(each, names) for each in np.unique(labels)[:20].astype(np.int64).tolist())
-        words = " or ".join(label_words(each, names) for each in chosen)
-        raise InputError(f"{path}: no cell has label {words}; there are {known}")
-    return cells
-
-
-def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64]:
-    """Numbers of the cells that make up the structure."""
-    if part.boundary:
-        return np.arange(len(loaded.mesh.cells))
-    if part.cell_set is not None:
-        if part.cell_set not in loaded.sets.cells:
-            known = ", ".join(loaded.sets.cells) or "none"
-            raise InputError(f'{path}: has no set of cells "{part.cell_set}"; it has {known}')
-        return loaded.sets.cells[part.cell_set]
-    assert part.below is not None
-    mean = cell_field(loaded, path, "mean")
-    chosen = largest_component(loaded.mesh.cells, mean < part.below)
-    if len(chosen) == 0:
-        raise InputError(f"{path}: no cell has a mean below {part.below:g}, they go from {mean.min():g} up")
-    of_faces = face_sets(loaded.mesh, boundary_rows(loaded.mesh), loaded.box)
-    touched = [name for name in chain(*FACE_NAMES[3]) if np.isin(of_faces[name][:, 0], chosen).any()]
-    if touched and len(chosen) < len(mean):
-        log.print(
-            f"the largest connected set below {part.below:g} touches the box's faces {', '.join(touched)}: it is the "
-            "air around the body, perhaps; --label or --set take a structure by its name"
-        )
-    if len(chosen) == len(mean):
-        show_warning(f"every cell has a mean below {part.below:g}: this is the mesh's own boundary")
-    return chosen
+        save_json(json_path, written.numbers)
+    return 0 if written.is_sound else 1

@@ -20,10 +20,9 @@ from tetopt.cli.options import ForceOption, ShownOptions, option
 from tetopt.incoming import json_of
 from tetopt.io.files import checked_output
 from tetopt.job.inputs import label_table, number_of, read_image, read_mesh, warn_of_other_image
-from tetopt.job.model import all_sets
 from tetopt.job.options import BoxPart
 from tetopt.model.fields import cell_fields
-from tetopt.model.file import MeshFile
+from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
 
 
@@ -53,7 +52,7 @@ def view_command(
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
-    sets = all_sets(mesh, loaded.box, fields, loaded.sets, table.names, former, is_told=False).facets
+    sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     from tetopt.report.exhibit import (  # matplotlib and pyvista are slow to load, and only needed here
         exhibit,

@@ -117,8 +117,7 @@ def _folders(folder: Path, beginning: str) -> list[Path]:
 
 def row_of(out: Path, key: str) -> Row:
     """The row of one subject, by its key; see `collect`."""
-    match = KEY_PATTERN.fullmatch(key)
-    assert match is not None, key
+    subject, _, session = key.partition("_")
     places = {
         "numbers": numbers_path(out, key),
         "log": log_path(out, key),
@@ -129,7 +128,7 @@ def row_of(out: Path, key: str) -> Row:
     if "thumbnail" in there and not_our_picture(out, key) is not None:
         del there["thumbnail"]
     files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
-    row = Row(key, match[1], match[2] or "", "missing", "has not been run", (), files, {}, {}, {}, {})
+    row = Row(key, subject, session, "missing", "has not been run", (), files, {}, {}, {}, {})
     if (path := failure_path(out, key)).exists():
         failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
         numbers = {f"failure.{name}": _scalar(failure[name]) for name in FAILURE_COLUMNS if name in failure}

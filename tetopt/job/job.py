@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from numbers import Real
 from pathlib import Path
 from textwrap import wrap
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tetopt.errors import InputError
 from tetopt.incoming import json_of
@@ -19,6 +20,7 @@ from tetopt.job.plan import resolved
 from tetopt.model.laws import LAW_OPTIONS
 from tetopt.public import LARGEST_INTEGER
 
+Record = TypeVar("Record")
 MOST_SAID = 80  # letters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # of a number, by what its value is called
 KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
@@ -57,11 +59,8 @@ class Job(JobOptions):
 
     def __post_init__(self) -> None:
         """Bring values to the kinds of their fields, and refuse those that cannot be."""
-        for name, kind in kinds_of(Job).items():
-            value, least = _of_kind(name, get_args(kind)[0], getattr(self, name)), option_of(kind).least
-            if value is not None and least is not None and value < least:
-                raise InputError(f"`{name}`: expected {least} or more, got {value}")
-            object.__setattr__(self, name, value)
+        for name in kinds_of(Job):
+            object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
         resolved(self)
 
     def given(self) -> dict[str, Any]:
@@ -160,6 +159,20 @@ def _kind_words(kind: Any) -> str:
 
 if Job.__doc__:
     Job.__doc__ = Job.__doc__.replace("PARAMETERS", _parameters())
+
+
+def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
+    """A record of options with values of the kinds of their fields; InputError for one that cannot be."""
+    return record(**{name: _of_field(record, name, value) for name, value in values.items()})
+
+
+def _of_field(record: Any, name: str, value: Any) -> Any:
+    """A value of the kind of a record's field, and no less than that may be."""
+    kind = kinds_of(record)[name]
+    value, least = _of_kind(name, get_args(kind)[0], value), option_of(kind).least
+    if value is not None and least is not None and value < least:
+        raise InputError(f"`{name}`: expected {least} or more, got {value}")
+    return value
 
 
 def _of_kind(name: str, kind: Any, value: Any) -> Any:

@@ -24,9 +24,16 @@ from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import build_model
-from tetopt.model.fields import is_result
-from tetopt.model.file import MATERIAL_FIELDS, MeshFile, loads_in, moduli_in, sets_beside
-from tetopt.model.file import completed as with_rest_of_file
+from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.file import (
+    MATERIAL_FIELDS,
+    MeshFile,
+    completed,
+    loads_in,
+    moduli_in,
+    sets_beside,
+    without_results,
+)
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, other_orders, parse_load
@@ -150,14 +157,6 @@ def solver_model(
     return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
 
 
-def completed(model: Model, loaded: MeshFile, solver: ModelOptions) -> Model:
-    """The model with what the mesh's file alone has; see `tetopt.model.file.completed`."""
-    model, lost = with_rest_of_file(model, loaded, is_of_file=solver.young is None and solver.bins is None)
-    if lost:
-        note(lost)
-    return model
-
-
 def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
     """The mesh's file without what a solver found on it, if moduli, densities or loads are to be others; a line."""
     if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
@@ -170,11 +169,7 @@ def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
         f"left out, as they are of other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; tetopt fem "
         "finds them anew"
     )
-    cell_data, point_data = (
-        {name: rows for name, rows in data.items() if name not in names}
-        for data in (loaded.cell_data, loaded.point_data)
-    )
-    return loaded._replace(cell_data=cell_data, point_data=point_data, field_data=texts)
+    return without_results(loaded)._replace(field_data=texts)
 
 
 def loads_of(loaded: MeshFile) -> list[str]:
@@ -232,14 +227,23 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     return model._replace(sets=Sets(facets, cells))
 
 
-def sets_and_table(
-    loaded: MeshFile, box: Box | None, fields: dict[str, NDArray], options: ModelOptions
-) -> tuple[Sets, dict[str, Any]]:
-    """The sets of a mesh's file, `all_sets`, and the texts of labels' names that go on into the next."""
+def model_of_file(
+    loaded: MeshFile, image: Image | None, options: ModelOptions, about: dict[str, Any], box: Box | None,
+    has_units: bool = True,
+) -> Model:  # fmt: skip
+    """The model that the options ask for, of a mesh's file and what it alone has; and a warning for odd units."""
+    mesh, fields = loaded.mesh, loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image))
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
-    of_loads = {parse_load(text, loaded.mesh.ndim).set_name for text in options.loads or ()}
-    sets = all_sets(loaded.mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
-    return sets, {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
+    of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
+    sets = all_sets(mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
+    words = {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
+    model = solver_model(mesh, image, options, fields, about | words, sets)
+    if has_units:
+        warn_of_units(model)
+    model, lost = completed(model, loaded, is_of_file=options.young is None and options.bins is None)
+    if lost:
+        note(lost)
+    return model
 
 
 def check_early(

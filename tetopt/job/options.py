@@ -81,6 +81,15 @@ class ImagePart(BoxPart):
     slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, in 2-D; for example k=90.", "slice")] = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class LabelledPart(ImagePart):
+    """Which part of an image file is read, and what gives labels to a mesh that was made without."""
+
+    labels: Annotated[
+        Path | None, Option("LABELS", "Label image: a cell gets the label of most of its voxels, for laws and sets.")
+    ] = None
+
+
 WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
 
 

@@ -55,10 +55,10 @@ def read(job: Job) -> Task:
     checked = plan(job)
     set_threads(job.threads)
     started("read", "reading and preparing the image, with its mask and labels")
-    return _read(with_parts(checked))
+    return read_planned(with_parts(checked))
 
 
-def _read(plan: Plan) -> Task:
+def read_planned(plan: Plan) -> Task:
     """The files that a plan names, and the defaults that depend on them."""
     source = left_source(plan) or read_source(plan.job, plan.job.label_names)
     plan.division.check_image(source.content.image)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.check import facets_on_box
 from tetopt.contents.domain import INSIDE_SHARE
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
-from tetopt.energy.sampling import cell_of_voxel, nearest_values
+from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
@@ -580,3 +580,32 @@ def _in_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _vtk_cells(cells: NDArray[np.int64]) -> NDArray[np.int64] | None:
     """Cells as VTK lists them: the points of each come after their number."""
     return np.insert(cells, 0, cells.shape[1], axis=1).ravel() if len(cells) else None
+
+
+class ImageFit(NamedTuple):
+    """How well the cells of a mesh fit an image."""
+
+    E_D: float  # intensity^2 mm^n
+    E_D_share_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
+    n_voxels: int  # voxel centres inside
+    n_empty_cells: int  # cells without one
+    overlap: Overlap | None  # voxels that lie in several cells
+
+
+def image_fit(image: Image, mesh: Mesh) -> ImageFit:
+    """E_D of a mesh, absolute and as share of the variance of the voxels that it covers.
+
+    Raises
+    ------
+    InputError
+        A mesh that covers none.
+    """
+    moments = cell_moments(image, mesh)
+    E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
+    n_voxels = int(moments.n_voxels.sum())
+    if n_voxels == 0:
+        raise InputError("mesh and image: no voxel centre lies inside the mesh; do both lie in the same world mm?")
+    mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
+    spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
+    n_empty = int((moments.n_voxels == 0).sum())
+    return ImageFit(E_D, E_D / spread if spread > 0.0 else None, n_voxels, n_empty, overlap_of(image, mesh))

@@ -79,9 +79,8 @@ def _row_html(row: Criterion, report: Report, entries: Sequence[CriterionEntry])
         elif number in best:
             kinds.append("best")
             mark = '<b class="mark">best</b>' if len(best) == 1 else '<b class="mark">best, tied</b>'
-        elif best and pipeline.kind == "tetopt":
-            top, why = entries[best[0]].value, undecided(row, report, number, best[0])
-            assert top is not None, "a winner has a value"
+        elif best and pipeline.kind == "tetopt" and (top := entries[best[0]].value) is not None:
+            why = undecided(row, report, number, best[0])
             kinds += [] if why else ["lost"]
             mark = f'<b class="mark">{html.escape(loss_text(each.value, top) + (why and f", {why}"))}</b>'
         cells.append(f'<td class="{html.escape(" ".join(kinds))}">{_value_html(pipeline, each)}{mark}</td>')

@@ -1,24 +1,26 @@
-"""What `tetopt cohort` is to do: all that can be refused before the first run is, and all of it is said."""
+"""What a cohort is to do: all that can be refused before the first run is, and all of it is said."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cli.options import CohortOptions, option_words, with_options
 from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
+from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState, state_of, strangers
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
+from tetopt.job.events import note
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
+from tetopt.job.texts import option_words, with_options
 from tetopt.model.laws import LAW_OPTIONS, law_file
 
 
@@ -71,13 +73,11 @@ def checked_suffix(text: str) -> str:
     """The suffix of meshes' files; InputError for one that is no format's."""
     suffix = text.lower() if text.startswith(".") else f".{text.lower()}"
     if suffix not in FORMATS:
-        raise InputError(f"--format: expected one of {', '.join(FORMATS)}, got {text}")
+        raise InputError(f"`mesh_format`: expected one of {', '.join(FORMATS)}, got {text}")
     return suffix
 
 
-def entries_of(
-    subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str, say: Callable[[str], None]
-) -> list[PlannedSubject]:
+def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str) -> list[PlannedSubject]:
     """The subjects with their options, and what there is of each.
 
     Raises
@@ -100,7 +100,9 @@ def entries_of(
         entries.append(PlannedSubject(subject, key(subject), own, plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))
-    return with_states(entries, out, suffix, say)
+    if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:
+        note(f"comparing the inputs and options of {n_there} subjects that are there with what is asked for")
+    return with_states(entries, out, suffix)
 
 
 def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -162,9 +164,7 @@ def _missing(job: JobOptions) -> Iterator[str]:
             yield f"{name}: {path} cannot be opened: {error.strerror}"
 
 
-def with_states(
-    entries: list[PlannedSubject], out: Path, suffix: str, say: Callable[[str], None]
-) -> list[PlannedSubject]:
+def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[PlannedSubject]:
     """The subjects with what there is of each; files are summed up where there is a mesh to compare with."""
 
     def state(entry: PlannedSubject) -> PlannedSubject:
@@ -173,8 +173,6 @@ def with_states(
             request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
         return entry._replace(state=state_of(out, entry.key, suffix, request))
 
-    if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:
-        say(f"comparing the inputs and options of {n_there} subjects that are there with what is asked for")
     with ThreadPoolExecutor() as pool:
         return list(pool.map(state, entries))
 

@@ -1,0 +1,76 @@
+"""What commands do with files, called from Python: the same numbers, files and refusals, and nothing printed."""
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+
+import tetopt
+from tetopt import InputError
+from tetopt.io.files import save_json
+from tetopt.job.convert import convert_file
+from tetopt.job.events import listened
+from tetopt.job.judge import judge
+from tetopt.job.options import LabelledPart, ModelOptions, SolverOptions
+from tetopt.job.solve import solve_file
+from tetopt.job.surface import SurfacePart, write_surface
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder with an image, labels, and a mesh of them."""
+    phantom = tetopt.load_phantom("sphere")
+    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
+    tetopt.save_image(tmp_path / "image.nii.gz", image)
+    mesh = tetopt.lattice_mesh(image, nodes=200)
+    tetopt.save_mesh(
+        tmp_path / "a.vtu", mesh, {"label": tetopt.cell_labels(labels, mesh), **tetopt.cell_fields(mesh, image)}
+    )
+    return tmp_path
+
+
+def test_python_has_the_numbers_of_the_commands(place, capfd):
+    mesh, image = place / "a.vtu", place / "image.nii.gz"
+    load = {"young": "0=1,1=5", "loads": ["compress:5%"]}
+    with listened(lambda event: None):
+        numbers = [
+            judge(mesh, image).numbers,
+            solve_file(mesh, model=ModelOptions(**load), part=LabelledPart()).numbers,
+            convert_file(mesh, place / "b.inp", solver=SolverOptions(**load), part=LabelledPart()).numbers,
+            write_surface(mesh, place / "b.stl", SurfacePart(label="1")).numbers,
+        ]
+    assert capfd.readouterr() == ("", "")
+    first = (place / "b.inp").read_bytes(), (place / "b.stl").read_bytes()
+    model = ("--young", load["young"], "--load", "compress:5%")
+    commands = [
+        ("quality", mesh, "--image", image), ("fem", mesh, *model),
+        ("convert", mesh, place / "b.inp", *model), ("surface", mesh, "-o", place / "b.stl", "--label", "1"),
+    ]  # fmt: skip
+    for words, ours in zip(commands, numbers, strict=True):
+        assert exit_code(*words, "--force", "--json", place / "command.json") == 0
+        save_json(place / "python.json", ours)
+        assert numbers_in(place / "python.json") == numbers_in(place / "command.json")
+    assert ((place / "b.inp").read_bytes(), (place / "b.stl").read_bytes()) == first
+
+
+def test_refusals_name_arguments(place):
+    mesh = place / "a.vtu"
+    with pytest.raises(InputError, match=r"^`mask` and `labels`: give the `image`"):
+        judge(mesh, labels=place / "image.nii.gz")
+    with pytest.raises(InputError, match=r"moduli: give `young`"):
+        solve_file(mesh, model=ModelOptions(), part=LabelledPart())
+    with pytest.raises(InputError, match=r"^`mask`: there is no `image`"):
+        convert_file(mesh, place / "b.inp", solver=SolverOptions(), part=LabelledPart(), mask=mesh)
+    with pytest.raises(InputError, match=r"give one of `below`, `label`, `cell_set`"):
+        write_surface(mesh, place / "b.stl", SurfacePart())
+
+
+def test_a_violated_requirement_is_told(place):
+    """As by `tetopt quality`, whose exit code is 1 then."""
+    cells = np.array([[0, 1, 2, 3], [0, 1, 2, 4]])
+    points = np.array([[0, 0, 0], [30, 0, 0], [0, 30, 0], [5, 5, 20], [6, 6, 30]])
+    tetopt.save_mesh(place / "overlapping.vtu", tetopt.Mesh(points, cells))
+    events = []
+    with listened(events.append):
+        wrong = judge(place / "overlapping.vtu", check=True).tell()
+    assert wrong == [event.text for event in events if event.kind == "violated"]
+    assert wrong[0].startswith(str(place / "overlapping.vtu"))

@@ -1,0 +1,84 @@
+"""What the subjects of a cohort are predicted to take."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import fields
+from io import StringIO
+from typing import NamedTuple
+
+from tetopt.budget import available_bytes
+from tetopt.cluster.workers import Need
+from tetopt.cohort.options import CohortOptions
+from tetopt.cohort.plan import PlannedSubject
+from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
+from tetopt.errors import InputError
+from tetopt.io.images import file_shape
+from tetopt.job.events import listened
+from tetopt.job.options import SizeOptions
+from tetopt.job.predict import size_by_headers
+from tetopt.job.read import read_planned
+
+LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
+
+
+class Estimate(NamedTuple):
+    """What the subjects that are to be run are predicted to take."""
+
+    each: dict[str, Prediction]  # by key, on one thread
+
+    def largest(self) -> float:
+        """Bytes of the one that takes most, 0 of none."""
+        return max((prediction.peak_bytes for prediction in self.each.values()), default=0.0)
+
+    def seconds(self) -> float:
+        """Of all, one after the other."""
+        return sum(prediction.seconds for prediction in self.each.values())
+
+
+def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
+    """What subjects are predicted to take, each on one thread: by their headers, and some of each kind as they are.
+
+    Of the same kind are those of as many files and the same options; of one whose images have several shapes, one of
+    each shape is read, up to `LIKE_READS`, as what labels take differs more between than within.
+    """
+    speed = calibrated_speed() if entries else 1.0
+    like: dict[tuple[object, ...], dict[tuple[int, ...], RunSize]] = {}
+    reads: Counter[tuple[object, ...]] = Counter()
+    each = {}
+    for entry in entries:
+        job = entry.job
+        files = len(job.images), job.mask is None, job.labels is None
+        kind = (*files, job.background, *(getattr(job, field.name) for field in fields(SizeOptions)))
+        known = like.setdefault(kind, {})
+        try:
+            shape = file_shape(job.images[0]) or ()
+            if shape not in known and reads[kind] < LIKE_READS:
+                reads[kind] += 1
+                if (size := _read_size(entry)) is not None:
+                    known[shape] = size
+            nearest = known.get(shape) or next(iter(known.values()), None)
+            each[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
+        except InputError:  # its run will say it
+            continue
+    return Estimate(each)
+
+
+def _read_size(entry: PlannedSubject) -> RunSize | None:
+    """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
+    try:
+        with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
+            return read_planned(entry.plan).size
+    except (InputError, OSError):
+        return None
+
+
+def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
+    """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
+    sizes = [each.peak_bytes for each in estimate.each.values()]
+    free = available_bytes()
+    if free is not None and cohort.scheduler is None and cohort.cluster is None:
+        sizes = [each for each in sizes if each <= free]
+    return Need(n_tasks, max(sizes, default=0.0), threads)

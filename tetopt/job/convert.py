@@ -1,0 +1,157 @@
+"""A mesh's file written for a solver, with what else is said of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.check import check_unfolded
+from tetopt.contents.align import resample_mask
+from tetopt.contents.content import continued
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io.abaqus import input_sets
+from tetopt.io.formats import format_of
+from tetopt.io.frd import read_frd
+from tetopt.io.images import sha256
+from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.events import note, progress
+from tetopt.job.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.model import (
+    REACTIONS_TEXT,
+    check_solver_options,
+    loads_of,
+    model_of_file,
+    save_for_solver,
+    with_chosen_sets,
+    without_stale_results,
+)
+from tetopt.job.options import ImagePart, LabelledPart, SolverOptions
+from tetopt.model.fields import is_stress
+from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile, without_results
+from tetopt.model.model import Model
+from tetopt.model.sets import Sets, box_of, box_text, merged_sets
+from tetopt.report.summary import model_summary, versions
+
+
+class Converted(NamedTuple):
+    """What was written for a solver."""
+
+    model: Model
+    options: SolverOptions  # with what they were by default
+    numbers: dict[str, Any]  # as `tetopt convert --json` writes them
+
+
+def convert_file(
+    mesh: Path, output: Path, *, solver: SolverOptions, part: LabelledPart, image: Path | None = None,
+    mask: Path | None = None, results: Path | None = None,
+) -> Converted:  # fmt: skip
+    """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's suffix.
+
+    Parameters
+    ----------
+    mesh : Path
+    output : Path
+    solver : SolverOptions
+    part : LabelledPart
+    image : Path, optional
+        What means and laws are of, instead of what the mesh's file has.
+    mask : Path, optional
+        Only what lies in it counts.
+    results : Path, optional
+        CalculiX's of this mesh, which come back onto it.
+
+    Raises
+    ------
+    InputError
+        Options that cannot be, files that cannot be read or do not belong together.
+    """
+    if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
+        raise InputError(f"`results`: expected OUT named {' or '.join(VTK_SUFFIXES)}, got {output}")
+    needs_image = {"mask": mask, "volume": part.volume, "crop": part.crop, "slice": part.slice_}
+    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
+        raise InputError(f"`{lost[0]}`: there is no `image`")
+    loaded = read_mesh(mesh)
+    check_unfolded(loaded.mesh, source=str(mesh))
+    loaded = with_labels(loaded, part.labels)
+    loaded = without_stale_results(loaded, solver) if results is None else _with_results(loaded, results)
+    solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
+    check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
+    if image is None and solver.average is not None:
+        raise InputError(f"`average`: {solver.average} is over an image's voxels; give the image (`image`)")
+    if not solver.loads and not is_surface:
+        solver = replace(solver, loads=loads_of(loaded))
+    about, box = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box
+    voxels: Image | None = None
+    if image is not None:
+        whole, voxels = _images(image, mask, part, loaded.mesh.ndim)
+        if warn_of_other_image(loaded, mesh, image):
+            about = {}
+        box = box_of(whole) if box is None else box
+        about |= {"image": image.name, "image_sha256": sha256(image)}
+    if box is not None:
+        about["box"] = box_text(box)
+    if is_surface:  # which holds no materials
+        kept = {name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS}
+        loaded = loaded._replace(cell_data=kept)
+    model = with_chosen_sets(model_of_file(loaded, voxels, solver, about, box), output, solver)
+    save_for_solver(output, model, solver)
+    files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
+    files |= {} if results is None else {"results": results.name}
+    files |= {} if part.labels is None else {"labels": part.labels.name}
+    return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
+
+
+def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
+    """The texts of the mesh's file that go on; the forces that hold sets, which are in RAS+ and mN, only as such."""
+    is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
+    names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
+    return {name: text for name in (*TEXTS_KEPT, *names) if (text := loaded.text(name)) is not None}
+
+
+def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
+    """The mesh with a solver's results in place of earlier ones, of the order that was solved; they are told."""
+    results = read_frd(path, loaded.mesh)
+    for line in results.notes:
+        note(f"{path}: {line}")
+    for name, values in results.point_data.items():
+        if values.shape[1:] != (9,):  # tensors have their von Mises stress beside them
+            largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
+            progress(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}")
+    loaded = without_results(loaded)
+    sets = _sets_with_input(loaded, path.with_suffix(".inp"))
+    return loaded._replace(point_data=loaded.point_data | results.point_data, order=results.order, sets=sets)
+
+
+def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
+    """The mesh's sets and those of the solver's input file, if it is there and of this mesh; a line."""
+    from_input = input_sets(path, loaded.mesh) if path.is_file() else None
+    if from_input is None:
+        note(f"{path}: not the input file of this mesh, or missing: its sets are not added")
+        return loaded.sets
+    sets, renamed = merged_sets(loaded.sets, from_input)
+    for old, new in renamed.items():
+        note(f'{path}: renamed set "{old}" to "{new}" (name already in use)')
+    return sets
+
+
+def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
+    """The order of the cells to be written: as asked for, else as in the mesh's file, if the format has it."""
+    form = format_of(output)
+    if solver.order is not None or loaded.order == 1 or form.has_quadratic:
+        return solver.order or loaded.order
+    if not form.is_surface:
+        note(f"{output}: {form.what} has no quadratic cells; the mesh's are written as linear ones")
+    return 1
+
+
+def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:
+    """The image as it is, and as it counts: beyond the mask continued by the nearest value inside."""
+    whole, beside = image_and_others(path, part)
+    if whole.ndim != ndim:
+        raise InputError(f"{path}: expected a {ndim}-D image, as the mesh is, got a {whole.ndim}-D one")
+    return whole, continued(whole, None if mask_path is None else beside(mask_path, resample_mask))

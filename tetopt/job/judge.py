@@ -1,0 +1,204 @@
+"""A mesh's file, measured: its shape, how well its cells fit an image, and whether it is what its run was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.check import check_mesh, manifold_problems
+from tetopt.energy.sampling import cell_moments
+from tetopt.engine.loop import MeshingResult
+from tetopt.errors import InputError
+from tetopt.incoming import json_of
+from tetopt.job.advice import tell_violated
+from tetopt.job.events import violated, warning
+from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image
+from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
+from tetopt.job.source import Source, read_source
+from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
+from tetopt.measure.quality import Quality, quality
+from tetopt.measure.requirements import judged
+from tetopt.model.file import MeshFile
+from tetopt.report.summary import fidelity, size_summary
+
+
+class Judgement(NamedTuple):
+    """What was measured of a mesh's file."""
+
+    path: Path
+    loaded: MeshFile
+    shape: Quality
+    numbers: dict[str, Any]  # all of them, as `tetopt quality --json` writes them
+    is_checked: bool
+    source: Source | None = None  # what it was measured on
+    fit: ImageFit | None = None
+    result: MeshingResult | None = None  # the mesh as that of a run, with the requirements that it misses
+    measured: dict[str, Any] = {}  # noqa: RUF012 - how well mask, labels and contrasts are met; nobody changes it
+
+    @property
+    def is_masked(self) -> bool:
+        """Whether it was made within a mask or without a background."""
+        return _was_masked(self.loaded) or (self.source is not None and self.source.mask is not None)
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether it should fill the image's box."""
+        return _fills_box(self.loaded, self.source)
+
+    @property
+    def left_out(self) -> list[str]:
+        """What counted for the run that made it, and does not here."""
+        return [] if self.source is None else _left_out(self.loaded, self.source)
+
+    def tell(self) -> list[str]:
+        """Tell what is wrong with it; that, a line each. What is only good to know is a warning."""
+        problems: list[str] = self.numbers.get("problems", [])
+        for remark in self.numbers.get("remarks", []):
+            warning(f"{self.path}: {remark}")
+        overlap = None if self.fit is None else self.fit.overlap
+        wrong = [f"{self.path}: {problem}" for problem in (*problems, *([] if overlap is None else [overlap]))]
+        for line in wrong:
+            violated(line)
+        if self.source is None or self.result is None:
+            return wrong
+        known = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
+        missed = {name: words for name, words in self.result.missed.items() if name not in known}
+        measured = self.measured
+        if not self.is_checked:  # what makes the numbers above meaningless
+            missed, measured = {name: words for name, words in missed.items() if name == "mask"}, {}
+        return wrong + tell_violated(self.result._replace(missed=missed), measured, self.source.mask_word)
+
+
+def judge(
+    mesh: Path, image: Path | None = None, mask: Path | None = None, labels: Path | None = None,
+    *, part: ImagePart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
+) -> Judgement:  # fmt: skip
+    """Measure a mesh's file: its shape, and on an image, with a mask and labels beside it, how well its cells fit.
+
+    With `check`, also whether it is a mesh, and, on an image, what its run was asked for.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read, or without those that they belong to.
+    """
+    if image is None and (mask is not None or labels is not None):
+        raise InputError("`mask` and `labels`: give the `image`, too, on whose voxels they are compared")
+    if label_names is not None and labels is None:
+        raise InputError("`label_names`: there are no `labels`")
+    loaded = read_mesh(mesh)
+    shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
+    numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
+    judgement = Judgement(mesh, loaded, shape, numbers, check)
+    if image is not None:
+        source = _source(loaded, image, mask, labels, part)
+        fit, result, measured = _measured(loaded, source)
+        measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
+        warn_of_other_image(loaded, mesh, image)
+        numbers |= {**measured, "image": image.name, "fit": fit}
+        judgement = judgement._replace(source=source, fit=fit, result=result, measured=measured)
+    if check:
+        problems, remarks = _checked(judgement)
+        numbers |= {"problems": problems, "remarks": remarks}
+        numbers |= {} if judgement.result is None else {"missed": dict(judgement.result.missed)}
+    return judgement
+
+
+def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
+    """What the mesh is measured on: the files named here, weighed as the mesh's file says that they were."""
+    inputs = _texts(loaded, "inputs")
+    level, tension, weight = (_number(inputs.get(name)) for name in ("background", "smooth_interfaces", "label_weight"))
+    weights = inputs.get("weights")
+    own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
+    options = SourceOptions(
+        images=[image], mask=mask, labels=labels, **vars(part),
+        background=None if mask is not None or level is None else repr(level),
+        weights=None if labels is None or own is None else repr(own),
+        label_weight=None if labels is None else weight,
+        smooth_interfaces=None if labels is None else tension,
+        keep_components=False,
+    )  # fmt: skip
+    return read_source(options)
+
+
+def _measured(loaded: MeshFile, source: Source) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
+    """How well the cells fit the image; the mesh as the result of a run; how well mask, labels and image are met."""
+    mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
+    fit = image_fit(source.image, mesh)
+    result = judged(mesh, source.content, of_cell, **_requirements(loaded, source))
+    is_uniform = source.content.variance == 0.0
+    fit = fit._replace(E_D=result.history[-1].E_D, E_D_share_of_variance=None if is_uniform else result.share)
+    measured = fidelity(source.labels, source.mask, mesh, of_cell)
+    if not (source.content.is_plain and source.content.region is None):
+        measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
+    return fit, result, measured
+
+
+def _requirements(loaded: MeshFile, source: Source) -> dict[str, Any]:
+    """What the run that made the mesh was asked for, as its file says; another program's mesh only fills the box."""
+    options = _texts(loaded, "options")  # of ours alone with a method
+    is_kept = options.get("method") == "fast" and options.get("iterations") != 0
+    return {
+        "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
+        "target_error": None if _left_out(loaded, source) else _number(options.get("target_error")),
+        "is_filled": "method" in options and _fills_box(loaded, source),
+    }
+
+
+def _left_out(loaded: MeshFile, source: Source) -> list[str]:
+    """What counted for the run that made the mesh, as its file says, and does not here."""
+    inputs, there = _texts(loaded, "inputs"), {"mask": source.mask, "labels": source.labels}
+    left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
+    images = inputs.get("images")
+    return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
+
+
+def _fills_box(loaded: MeshFile, source: Source | None) -> bool:
+    """Whether the mesh should fill the image's box: not within a mask, and not of another mesh's domain."""
+    is_masked = _was_masked(loaded) or (source is not None and source.mask is not None)
+    return not is_masked and _texts(loaded, "options").get("start") is None
+
+
+def _number(value: Any) -> float | None:
+    """A number of a mesh's file; None for anything else."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _checked(came: Judgement) -> tuple[list[str], list[str]]:
+    """What is wrong with a mesh; and if nothing is, what is no fault, and yet good to know.
+
+    That are interfaces of labels which are not manifolds; of a run that smoothed them, it is wrong.
+    """
+    mesh, image = came.loaded.mesh, None if came.source is None else came.source.contrasts[0]
+    problems = check_mesh(mesh, image, is_whole=not came.is_masked, is_filled=came.is_filled)
+    labels, touching = came.loaded.cell_data.get("label"), []
+    if problems or labels is None:
+        return problems, []
+    if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
+        touching = manifold_problems(mesh, labels)
+    is_smooth = (_number(_texts(came.loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    return (touching, []) if is_smooth else ([], touching)
+
+
+def _names(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> dict[str, dict[int, str]]:
+    """What those of the labels that have a name are called, as "label_names"; nothing if none has."""
+    of_rows = {row.label: names[row.label] for row in rows if row.label in names}
+    return {"label_names": of_rows} if of_rows else {}
+
+
+def _was_masked(loaded: MeshFile) -> bool:
+    """Whether the file says that it was made within a mask or without a background."""
+    inputs = _texts(loaded, "inputs")
+    return inputs.get("mask") is not None or inputs.get("background") is not None
+
+
+def _texts(loaded: MeshFile, name: str) -> dict[str, Any]:
+    """A table among the texts of the mesh's file; empty without one, or if it is another program's."""
+    try:
+        table = json_of(loaded.text(name) or "{}")
+    except ValueError:
+        return {}
+    return table if isinstance(table, dict) else {}

@@ -1,0 +1,226 @@
+"""A mesh's file solved with its loads, or an image's box compressed as in the paper."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io.formats import save_model
+from tetopt.io.images import sha256
+from tetopt.job.events import note, warning
+from tetopt.job.inputs import read_image, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.model import (
+    check_model_options,
+    loads_of,
+    model_of_file,
+    with_chosen_sets,
+)
+from tetopt.job.options import ImagePart, LabelledPart, ModelOptions, stated_part
+from tetopt.model.averages import DEFAULT_AVERAGE
+from tetopt.model.file import MeshFile, without_results
+from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
+from tetopt.model.model import Model, locking_words
+from tetopt.model.sets import box_of, box_text
+from tetopt.report.summary import model_summary, versions
+
+if TYPE_CHECKING:
+    from tetopt.fem.conditioning import Conditioning
+    from tetopt.fem.solution import Solution
+
+INTENSITY_LAW = "h"  # an image without a modulus: its intensities are the moduli, as in the paper
+PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
+SMALL_SHARE = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
+
+
+class SolvedModel(NamedTuple):
+    """What came of solving a mesh."""
+
+    model: Model
+    options: ModelOptions  # with what they were by default
+    solutions: list[Solution]  # of each step
+    extremes: Conditioning | None
+    numbers: dict[str, Any]  # all of them, as `tetopt fem --json` writes them
+
+
+def solve_file(
+    mesh: Path, image: Path | None = None, output: Path | None = None, *, model: ModelOptions, part: LabelledPart,
+    compress: float | None = None, conditioning: bool | None = None,
+) -> SolvedModel:  # fmt: skip
+    """Solve a mesh with its loads, and write what was found on it.
+
+    Parameters
+    ----------
+    mesh : Path
+    image : Path, optional
+        Laws are of its intensities. Without loads its box is compressed, and without a law they are the moduli.
+    output : Path, optional
+        A file of VTK's for the mesh with displacements, strains and stresses.
+    model : ModelOptions
+    part : LabelledPart
+    compress : float, optional
+        By how many percent the box is compressed, instead of other loads.
+    conditioning : bool, optional
+        Whether the first step's condition number is found; by default only of a compressed box.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or do not belong together; a mesh without moduli or loads; one that is not held.
+    """
+    if image is not None:
+        model = replace(model, young=model.young or INTENSITY_LAW, average=model.average or DEFAULT_AVERAGE)
+    _check_options(image, compress, model, part)
+    voxels = None if image is None else read_image(image, part)
+    loaded = with_labels(without_results(read_mesh(mesh)), part.labels)
+    if image is not None:
+        warn_of_other_image(loaded, mesh, image)
+    of_box = voxels is not None and not model.loads
+    if voxels is not None and of_box:
+        _check_box(voxels, loaded)
+    task = _model(loaded, voxels, _filled(model, loaded, voxels, compress))
+    solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
+    if output is not None:
+        save_model(output, with_chosen_sets(_with_results(task, solutions), output, model))
+    _advise(task, solutions)
+    options = {**asdict(model), "compress_percent": compress, **stated_part(part)}
+    options["label_names"] = None if model.label_names is None else model.label_names.name
+    files = {"mesh": mesh.name} | ({} if part.labels is None else {"labels": part.labels.name})
+    if image is not None:
+        files |= {"image": image.name, "image_sha256": sha256(image)}
+    about = {**files, "versions": versions(), "options": options}
+    numbers = {**about, **_numbers(task, solutions, extremes), **model_summary(task)}
+    return SolvedModel(task, model, solutions, extremes, numbers)
+
+
+def _check_options(image: Path | None, compress: float | None, model: ModelOptions, part: ImagePart) -> None:
+    """InputError for what is wrong whatever the files hold."""
+    if compress is not None and not 0.0 < compress <= MOST_COMPRESSION_PERCENT:
+        most = f"{MOST_COMPRESSION_PERCENT:g}"
+        raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
+    if compress is not None and model.loads:
+        raise InputError(
+            "`compress` and `loads`: give one of them, as in `loads` compress:5% `loads` pressure:left:1.5"
+        )
+    if image is None and (lost := [name for name, value in stated_part(part).items() if value is not None]):
+        raise InputError(f"`{lost[0]}`: there is no IMAGE, only a mesh")
+    if image is None and model.average is not None:
+        raise InputError("`average`: it is over an image's voxels; give the IMAGE before the MESH")
+    check_model_options(model, has_materials=True)
+
+
+def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None) -> ModelOptions:
+    """The options with what is left out taken from the mesh's file, or, of an image's box, from the paper's test."""
+    if model.order is None:
+        model = replace(model, order=loaded.order)
+    if compress is not None or (image is not None and not model.loads):
+        model = replace(model, loads=[f"compress:{PAPER_PERCENT if compress is None else compress!r}%"])
+    elif not model.loads:
+        model = replace(model, loads=loads_of(loaded))
+    if model.young is None and "young" not in loaded.cell_data:
+        raise InputError(
+            "the mesh's file has no moduli: give `young`, such as `young` 3.5, or the IMAGE before the MESH"
+        )
+    if not model.loads:
+        raise InputError(
+            "the mesh's file has no loads: give `loads`, such as `loads` compress:5%, "
+            "or `loads` hold:inferior `loads` pressure:superior:1.5"
+        )
+    return model
+
+
+def _check_box(image: Image, loaded: MeshFile) -> None:
+    """InputError unless the mesh fills the image's box: what is compressed is the box."""
+    from tetopt.fem.elasticity import box_faces, check_fills_box
+
+    box_faces(image, loaded.mesh)
+    check_fills_box(image, loaded.mesh)
+
+
+def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Model:
+    """The mesh with all that it is solved with."""
+    box = loaded.box if image is None else box_of(image)
+    about = {} if box is None else {"box": box_text(box)}
+    return model_of_file(loaded, image, options, about, box, has_units=options.young != INTENSITY_LAW)
+
+
+def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
+    """Each step solved, and the conditioning of the first, if it is to be known."""
+    from tetopt.fem.conditioning import conditioning
+    from tetopt.fem.solution import solve
+
+    try:
+        solutions = [solve(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
+        return solutions, conditioning(solutions[0].system) if is_conditioned else None
+    except RuntimeError as error:
+        raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
+
+
+def _with_results(model: Model, solutions: list[Solution]) -> Model:
+    """The model with what was found on its cells and nodes, and the reactions among its texts."""
+    from tetopt.fem.solution import solution_fields
+
+    cell_data, point_data, about = dict(model.cell_data), dict(model.point_data), dict(model.about)
+    for step, solution in enumerate(solutions, start=1):
+        fields = solution_fields(model.mesh, solution, step)
+        cell_data |= fields.cell_data
+        point_data |= fields.point_data
+        about["reactions" if step == 1 else f"reactions_step{step}"] = _lists(solution.reactions)
+    return model._replace(cell_data=cell_data, point_data=point_data, about=about)
+
+
+def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
+    return {name: force.tolist() for name, force in reactions.items()}
+
+
+def _advise(model: Model, solutions: list[Solution]) -> None:
+    """Lines where the cells are of the wrong order for the material, or the displacements too large for the method."""
+    if words := locking_words(model):
+        warning(words)
+    size = float(np.ptp(model.mesh.points, axis=0).max())
+    moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
+    if moved > SMALL_SHARE * size:
+        note(
+            f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length: small "
+            "displacements, which this solves, no longer hold; look at the loads and at what is held, or write a file "
+            "for CalculiX with `nonlinear`"
+        )
+
+
+def _numbers_of(solution: Solution) -> dict[str, Any]:
+    """The numbers of a step for the JSON file."""
+    from tetopt.fem.solution import von_mises
+
+    return {
+        "strain_energy": solution.strain_energy,
+        "spring_energy": solution.spring_energy,
+        "work": solution.work,
+        "largest_displacement": float(np.sqrt((solution.u**2).sum(axis=1).max())),
+        "largest_von_mises": float(von_mises(solution.stress).mean(axis=1).max()),
+        "reactions": _lists(solution.reactions),
+        "applied": solution.applied.tolist(),
+        "iterations": solution.n_iterations,
+    }
+
+
+def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | None) -> dict[str, Any]:
+    """All numbers for the JSON file; the strain energy is the first step's."""
+    numbers: dict[str, Any] = {
+        "n_nodes": len(model.mesh.points),
+        "n_nodes_in_all": len(solutions[0].u),
+        "n_cells": len(model.mesh.cells),
+        "order": model.order,
+        "young_kPa_min": float(solutions[0].young.min()),
+        "young_kPa_max": float(solutions[0].young.max()),
+        "strain_energy": solutions[0].strain_energy,
+        "steps": [_numbers_of(solution) for solution in solutions],
+    }
+    if extremes is not None:
+        numbers |= {"lambda_max": extremes.lambda_max, "cond": extremes.cond, "cg_iterations": extremes.cg_iterations}
+    units = {"lambda_max": "mN/mm", "strain_energy": "uJ", "reactions": "mN", "largest_von_mises": "kPa"}
+    return numbers | {"units": units}
