@@ -9,12 +9,11 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from itertools import chain, count
 from pathlib import Path
@@ -24,7 +23,6 @@ import numpy as np
 
 from tetopt.errors import InputError
 
-PIECES_SUFFIX = ".pvtu"  # of the files that are several: beside the one of that name a folder of pieces
 TEMPORARY_LETTERS = 40  # of an output's name that its temporary one begins with: names may be as long as they can be
 # What a folder answers that cannot be synchronised at all, as those of some network file systems.
 UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EBADF)
@@ -122,8 +120,6 @@ def checked_output(
         raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a link in a circle")
     if os.path.lexists(path) and not force:
         raise InputError(f"{path}: exists already; pass `force` to replace it")
-    if path.suffix.lower() == PIECES_SUFFIX:
-        _check_pieces(path, force)
     _check_once(path, place)
     _check_folder(path, place.parent)
     if (outputs := _OUTPUTS.get()) is not None:
@@ -151,33 +147,6 @@ def _check_once(path: Path, place: Path) -> None:
         place.exists() and any(other.exists() and place.samefile(other) for other in others)
     ):
         raise InputError(f"{path}: is an input of this command too, or another output; write somewhere else")
-
-
-def pieces_folder(path: Path) -> Path:
-    """The folder of the pieces of a file in several, beside it; InputError for a name that XML cannot tell, or ours."""
-    if path.stem in (".", "..") or "\\" in path.stem or not path.stem.isprintable():
-        raise InputError(f"{path}: its pieces are in a folder of that name, which takes printable letters, and no \\")
-    return path.with_suffix("")
-
-
-def _check_pieces(path: Path, force: bool) -> None:
-    """InputError unless the folder of pieces is free, or, with `force`, holds nothing but such pieces."""
-    folder = pieces_folder(path)
-    if path.is_symlink():
-        raise InputError(f"{path}: is a link, beside which its pieces would not be looked for; name the file itself")
-    if not os.path.lexists(folder):
-        return
-    if not force:
-        raise InputError(f"{folder}: exists already, where the pieces of {path} go; pass `force`")
-    if folder.is_symlink() or not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of pieces to replace, found something else; remove it first")
-    piece = re.compile(rf"{re.escape(path.stem)}_\d+\.vtu")
-    strangers = [each.name for each in os.scandir(folder) if not piece.fullmatch(each.name) or each.is_dir()]
-    if strangers:
-        raise InputError(f"{folder}: holds {min(strangers)}, which is no piece of {path}; write somewhere else")
-    named = [] if (outputs := _OUTPUTS.get()) is None else outputs.named
-    if any(Path(os.path.realpath(other)).parent == Path(os.path.realpath(folder)) for other in named):
-        raise InputError(f"{path}: would replace a folder with an input of this command; write somewhere else")
 
 
 def _check_folder(path: Path, folder: Path) -> None:
@@ -296,59 +265,6 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
                 os.rename(old, place)
             raise
         _synchronise_folder(place.parent)
-
-
-@contextmanager
-def pieces_written_whole(path: Path) -> Iterator[tuple[Path, Callable[[], AbstractContextManager[None]]]]:
-    """A temporary folder for the pieces of a file in several, and what gives it its name, within which that is written.
-
-    Until then the old file and folder stay as they are; if what is done within that fails, they come back. In the
-    instants between, and if the process is killed there, no file is there, so that none ever lists the pieces of
-    another. Rights as `written_whole`; those of the pieces are the file's.
-
-    Raises
-    ------
-    InputError
-        `checked_output` saw neither there, and now there is one.
-    OSError
-        As `written_whole`.
-    """
-    with ExitStack() as stack:
-        with telling(path):
-            new, aside = (_temporary_folder(stack, path, path.parent) for _ in range(2))
-        yield new, lambda: _moved_in(path, new, aside)
-
-
-@contextmanager
-def _moved_in(path: Path, new: Path, aside: Path) -> Iterator[None]:
-    """Within it the new folder of pieces has its name, and the file and the folder that were there are aside."""
-    folder, old, outputs = pieces_folder(path), aside / "file", _OUTPUTS.get()
-    may_replace = outputs is None or outputs.may_replace.get(_absolute(path), True)
-    if not may_replace and (os.path.lexists(path) or os.path.lexists(folder)):
-        raise InputError(f"{path}: another program has written it in the meantime, and without `force` it stays")
-    moves = [(a, b) for a, b in ((path, old), (folder, aside / "pieces"), (new, folder)) if os.path.lexists(a)]
-    done: list[tuple[Path, Path]] = []
-    try:
-        with telling(path):
-            for each in new.iterdir():
-                _on_disk(each, path)
-            _take_rights(new, folder)
-            for here, there in moves:
-                os.rename(here, there)
-                done.append((here, there))
-            _synchronise_folder(path.parent)
-        yield
-        with telling(path):
-            if old.exists():
-                _take_rights(path, old)
-    except BaseException as error:
-        if done and not isinstance(error, TakenError):  # else it is another program's
-            with suppress(OSError):
-                os.unlink(path)
-        for here, there in reversed(done):
-            with suppress(OSError):  # what is told is what went wrong before
-                os.rename(there, here)
-        raise
 
 
 @contextmanager
