@@ -33,10 +33,10 @@ from tetopt.engine.flips import flip
 from tetopt.engine.loop import GRADED_K_D
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 from tetopt.start.delaunay import delaunay
+from tetopt.system.files import checked_output, save_json
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -23,16 +23,16 @@ from typing import Any
 import numpy as np
 
 from tetopt import Image, InputError, load_phantom
-from tetopt.budget import peak_bytes
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.tasks import Done, run_tasks
 from tetopt.cluster.workers import workers
 from tetopt.engine.loop import IterationRecord
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.zarr_images import save_zarr
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import PartsRequest, Round, Runner, mesh_in_parts
 from tetopt.parts.work import VolumeFile, save_volume
+from tetopt.system.budget import peak_bytes
+from tetopt.system.files import checked_output, save_json
 
 BOX_MM = 204.8
 N_BALLS = 400

@@ -25,10 +25,10 @@ from tetopt.energy.sampling import nearest_values
 from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import compare
 from tetopt.geometry.quadratic import gauss_rule, quadratic
-from tetopt.io.files import checked_output, save_json
 from tetopt.model.averages import element_young, parse_average
 from tetopt.study.compare import Standard, default_law, prepared
 from tetopt.study.compare_report import Settings
+from tetopt.system.files import checked_output, save_json
 
 POINTS = "points"
 AVERAGES = ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic", "hill", "gauss", "nodes", POINTS)

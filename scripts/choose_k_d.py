@@ -18,10 +18,10 @@ import numpy as np
 
 import tetopt
 from tetopt.fem.reference import averaged
-from tetopt.io.files import checked_output, save_json
 from tetopt.measure.segmentation import thresholded
 from tetopt.study.compare import default_law, measured, prepared
 from tetopt.study.compare_report import Settings, Simulation
+from tetopt.system.files import checked_output, save_json
 
 PHANTOM_NAMES = ("sphere", "two_spheres", "ellipsoids_brain")
 SHOWN_ERRORS = ("strain_energy", "displacement", "interface_strain")

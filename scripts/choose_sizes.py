@@ -20,10 +20,10 @@ from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases, error_of
 
 import tetopt
 from tetopt.fem.reference import at_centres
-from tetopt.io.files import checked_output, save_json
 from tetopt.start.sizes import COARSEST_SHARE
 from tetopt.study.compare import Standard, default_law, measured, prepared
 from tetopt.study.compare_report import Settings
+from tetopt.system.files import checked_output, save_json
 
 STANDARD_NU = "0.3"
 

@@ -29,9 +29,9 @@ from tetopt.energy.discretization import combined
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho
-from tetopt.io.files import checked_output, save_bytes
 from tetopt.measure.quality import bad_kinds
 from tetopt.report.figures import CURVE_COLOURS, MESH_LINE, save_figure
+from tetopt.system.files import checked_output, save_bytes
 
 PALETTE_COLOURS = (256, 128, 64, 32)  # as many as the bytes allow, of PNGs whose pixels are numbers of colours
 LARGEST_BYTES = 250_000  # of a picture, so that a page loads at once

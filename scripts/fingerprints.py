@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 
 import tetopt
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
+from tetopt.system.files import checked_output, save_json
 
 # The words after `tetopt mesh`, by the name of the run; T1, GM, TISSUE, BRAIN, ... are files made below.
 RUN_WORDS = {

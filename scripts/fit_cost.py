@@ -29,12 +29,12 @@ import numpy as np
 import scipy
 
 import tetopt
-from tetopt.budget import BYTES_PER_GB, peak_bytes
 from tetopt.engine.cost import RunSize, calibration, memory_terms, once_terms, swept_terms
-from tetopt.interpreter import python_command
-from tetopt.io.files import checked_output, written_whole
 from tetopt.io.images import cropped
 from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.system.budget import BYTES_PER_GB, peak_bytes
+from tetopt.system.files import checked_output, written_whole
+from tetopt.system.interpreter import python_command
 
 # Name and words of each run; those with a star are left out of the fit. {data} is the folder of development data.
 # Of those that are bare no pictures are drawn.

@@ -19,11 +19,11 @@ import trimesh
 import tetopt
 from tetopt.engine.loop import IterationRecord
 from tetopt.geometry.topology import boundary_facets, components, facets
-from tetopt.io.files import checked_output, save_json, written_whole
 from tetopt.io.images import sha256
 from tetopt.report.figures import save_run_figures
 from tetopt.report.scene import save_scenes, structure_before_slices
 from tetopt.report.summary import run_summary
+from tetopt.system.files import checked_output, save_json, written_whole
 
 
 def main(argv: Sequence[str] | None = None) -> int:

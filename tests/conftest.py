@@ -13,7 +13,7 @@ import schemas
 from hypothesis import settings
 from order import LONGEST_FILES
 
-import tetopt.io.files
+import tetopt.system.files
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
@@ -53,7 +53,7 @@ def opengl() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def described_numbers():
     """Whatever JSON a test has tetopt write in this process keeps to its schema, if its kind has one."""
-    save_text = tetopt.io.files.save_text
+    save_text = tetopt.system.files.save_text
 
     def checked(path, text):
         if Path(path).suffix == ".json":
@@ -61,5 +61,5 @@ def described_numbers():
         save_text(path, text)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.io.files, "save_text", checked)
+        patch.setattr(tetopt.system.files, "save_text", checked)
         yield

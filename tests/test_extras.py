@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tetopt.extras import install_hint
+from tetopt.system.extras import install_hint
 
 PYPROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = {

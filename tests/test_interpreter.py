@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from models import sample_image
 
-from tetopt.interpreter import others_environment
 from tetopt.io.images import save_image
+from tetopt.system.interpreter import others_environment
 
 MODULES = sorted(name for name in sys.stdlib_module_names | packages_distributions().keys() if name.isidentifier())
 PLANTED = "import os\nopen({path!r}, 'a').write(__name__ + ' ')\n"

@@ -13,9 +13,9 @@ import numba
 import numpy as np
 import pytest
 
-from tetopt import cache, kernel_cache, kernels
-from tetopt.kernel_types import by_value
-from tetopt.kernels import (
+from tetopt.system import cache, kernel_cache, kernels
+from tetopt.system.kernel_types import by_value
+from tetopt.system.kernels import (
     Bools1,
     Floats1,
     Floats2,
@@ -139,7 +139,7 @@ def test_a_key_of_another_version_is_read(monkeypatch):
     renamed = here.replace(b"Room", b"Rope")
     assert len(renamed) == len(here)
     assert isinstance(pickle.loads(renamed), numba.types.Opaque)
-    monkeypatch.setattr("tetopt.kernel_links.checksum", lambda: "another")
+    monkeypatch.setattr("tetopt.system.kernel_links.checksum", lambda: "another")
     assert isinstance(pickle.loads(here), numba.types.Opaque)
 
 
@@ -166,7 +166,7 @@ def test_by_value_is_a_named_tuple_of_its_arrays():
 MODULE = """
 from __future__ import annotations
 from typing import NamedTuple
-from tetopt.kernels import Floats1, entry, unit
+from tetopt.system.kernels import Floats1, entry, unit
 
 class Row(NamedTuple):
     x: Floats1
@@ -180,7 +180,7 @@ PROGRAM = """
 import os, sys
 import numpy as np
 import some_kernels as k
-from tetopt import kernels
+from tetopt.system import kernels
 os.cpu_count = lambda: 2
 started, start = [], kernels.started
 kernels.started = lambda *words: started.append(1) or start(*words)
@@ -243,7 +243,7 @@ def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, tmp_p
         monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
     else:
         monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # not `delenv`: what is set meanwhile has to go again
-        monkeypatch.setattr(cache, "__file__", str(tmp_path / "file" / "cache.py"))
+        monkeypatch.setattr(cache, "__file__", str(tmp_path / "file" / "system" / "cache.py"))
         monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "file")
     folder, notice = place()
     assert "compiled anew in each run, half a minute" in notice
@@ -278,7 +278,7 @@ def test_a_folder_that_everybody_may_write_is_no_cache(place, monkeypatch, tmp_p
     assert folder != tmp_path
     os.rmdir(folder)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "system" / "cache.py"))
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "__pycache__").chmod(0o777)
     monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "own")
@@ -310,14 +310,14 @@ import sys, warnings
 warnings.showwarning = lambda message, *_: print("warned:", message)
 import numpy as np
 import some_kernels as k
-from tetopt import kernels
+from tetopt.system import kernels
 kernels._compile_apart = lambda *_: None  # what is compiled is compiled here
 {before}
 kernels.link([k.step_2])
 print(k.step_2(k.Row(np.ones(3)), 2), k.plain(2.0), [f.was_cached for f in (k.step_0, k.step_1, k.step_2)])
 """
 PLAIN = """
-from tetopt.kernel_cache import njit
+from tetopt.system.kernel_cache import njit
 
 @njit(cache=True)
 def plain(x):
@@ -494,7 +494,7 @@ BEYOND = """
 from __future__ import annotations
 from typing import NamedTuple
 import numpy as np
-from tetopt.kernels import Floats1, entry, run, unit
+from tetopt.system.kernels import Floats1, entry, run, unit
 
 class Row(NamedTuple):
     x: Floats1
@@ -557,8 +557,8 @@ from __future__ import annotations
 import sys
 from typing import NamedTuple
 import numpy as np
-from tetopt import kernels
-from tetopt.kernels import Floats1, entry, run, unit
+from tetopt.system import kernels
+from tetopt.system.kernels import Floats1, entry, run, unit
 
 class Row(NamedTuple):
     x: Floats1
@@ -624,7 +624,7 @@ CHANGES = (
     ("", None),
     ("import os; os.environ['TETOPT_PLAIN_NUMBA'] = '1'", None),
     ("del numba.extending.NativeValue", "ImportError: cannot import name 'NativeValue'"),
-    (UNKNOWN_SYMBOLS, "RuntimeError: the linker has no symbol tetopt.kernels._double"),
+    (UNKNOWN_SYMBOLS, "RuntimeError: the linker has no symbol tetopt.system.kernels._double"),
     ("del numba.core.caching.FunctionCache", "no _data_path, _dump, "),
 )
 
@@ -660,7 +660,7 @@ def test_kernels_hold_where_numba_has_changed(tmp_path):
 SMALL_RUN = """
 import hashlib
 import tetopt
-from tetopt import kernels
+from tetopt.system import kernels
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=3)
 labels = tetopt.Image((image.data > image.data.mean()).astype("int64"), image.affine)

@@ -16,7 +16,6 @@ from commands import exit_code, mesh_words, numbers_in
 from models import sample_image
 
 import tetopt
-from tetopt import budget
 from tetopt.cli import run as cli_run
 from tetopt.cli import warm_up
 from tetopt.contents.content import content, plain
@@ -31,6 +30,7 @@ from tetopt.job.events import listened, started
 from tetopt.job.meshing import prepare, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of
+from tetopt.system import budget
 
 GIB = 1 << 30
 

@@ -14,7 +14,7 @@ from schemas import KINDS, REFERENCE, assert_described, kind_of
 
 import tetopt
 from tetopt.cli import main
-from tetopt.io.files import save_json
+from tetopt.system.files import save_json
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs" / "_extensions"))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tetopt import budget
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.volumes import VoxelsInFile
+from tetopt.system import budget
 
 AFFINE = np.array([[0.0, -2.0, 0.5, 3.0], [1.0, 0.0, 0.0, -7.0], [0.0, 0.25, 3.0, 11.0], [0.0, 0.0, 0.0, 1.0]])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tetopt import kernels
+from tetopt.system import kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -165,10 +165,10 @@ def main(folder):
     become_windows()
     os.chdir(folder)
     import_all()
-    import tetopt.budget
+    import tetopt.system.budget
     from tetopt.cli import main as run
 
-    tetopt.budget.PROC_FOLDER = tetopt.budget.GROUP_FOLDER = Path("there", "is", "no", "proc")
+    tetopt.system.budget.PROC_FOLDER = tetopt.system.budget.GROUP_FOLDER = Path("there", "is", "no", "proc")
     for line in COMMANDS.splitlines():
         code = run(line.split())
         if code != 0:

@@ -8,7 +8,7 @@ from typing import Any
 
 import lazy_loader
 
-from tetopt.cache import place_cache
+from tetopt.system.cache import place_cache
 
 place_cache()  # before numba is loaded
 

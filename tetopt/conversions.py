@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.geometry.simplex import oriented
 from tetopt.notebook import in_kernel
+from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid

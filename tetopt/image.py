@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt import notebook
-from tetopt.budget import check_memory
 from tetopt.errors import InputError
+from tetopt.system.budget import check_memory
 
 SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
 # Of a voxel's longest to its shortest extent, shear included: slices of 10 mm with pixels of 0.1 mm have 100. At a

@@ -49,10 +49,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.image import SINGULAR_DETERMINANT, Image, transformed
-from tetopt.incoming import toml_of
+from tetopt.system.budget import check_memory
+from tetopt.system.incoming import toml_of
 
 PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and what is written of them; 17 were measured
 MAX_PHANTOM_VOXELS = 2**36  # 4096^3: 137 GB of 16 bits, box by box

@@ -14,12 +14,12 @@ import numba
 import numpy as np
 import pytest
 
-from tetopt.budget import PROC_FOLDER
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.tasks import SchedulerLost, run_tasks
 from tetopt.cluster.workers import workers
 from tetopt.errors import InputError
-from tetopt.interpreter import python_command, python_environment
+from tetopt.system.budget import PROC_FOLDER
+from tetopt.system.interpreter import python_command, python_environment
 
 LIMIT = 0.8e9  # of a worker, which has 0.24 GB with numba loaded
 

@@ -22,8 +22,8 @@ from tetopt.cluster.crew import About, Folders, Need, Newcomers
 from tetopt.cluster.jobs import cluster_of, configuration, request
 from tetopt.cluster.workers import _threads_each, shares, workers
 from tetopt.errors import InputError
-from tetopt.interpreter import python_command, python_environment
 from tetopt.io.images import save_image
+from tetopt.system.interpreter import python_command, python_environment
 
 GB = 1e9
 

@@ -8,11 +8,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from tetopt.budget import resident_bytes
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.workers import workers
 from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
+from tetopt.system.budget import resident_bytes
 
 
 def nothing(job: SubjectTask) -> Ended:

@@ -21,10 +21,10 @@ from tetopt.cohort.numbers import (
     orientation_code,
     save_table,
 )
-from tetopt.incoming import toml_of
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
+from tetopt.system.incoming import toml_of
 
 RNG = np.random.default_rng(0)
 

@@ -55,7 +55,7 @@ def load_everything() -> None:
     modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py", "zarr", "zarr.codecs"]
     for name in modules:
         import_module(name)
-    kernels = import_module("tetopt.kernels")
+    kernels = import_module("tetopt.system.kernels")
     kernels.link(kernels.roots())
 
 

@@ -14,7 +14,7 @@ from hostile.faults import Steps, left_in
 from models import sample_image, sample_model
 
 import tetopt
-from tetopt.io.files import checked_output, outputs_of_command, save_json
+from tetopt.system.files import checked_output, outputs_of_command, save_json
 
 MODEL, IMAGE = sample_model(3), sample_image(3)
 WRITERS = {

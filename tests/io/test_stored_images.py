@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from commands import exit_code
 
-from tetopt import budget
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import zarr_images
@@ -21,6 +20,7 @@ from tetopt.io.images import file_shape, load_image, save_image, sha256
 from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
 from tetopt.io.zarr_images import save_zarr
 from tetopt.phantom import load_phantom
+from tetopt.system import budget
 
 zarr = pytest.importorskip("zarr")
 numcodecs = pytest.importorskip("numcodecs")

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt import budget, incoming
 from tetopt.cli import main
 from tetopt.errors import InputError
-from tetopt.incoming import json_of, text_of, toml_of
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
 from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
@@ -27,6 +25,8 @@ from tetopt.job.model import parsed_bins
 from tetopt.model.labels import labels_named
 from tetopt.model.laws import load_law
 from tetopt.phantom import load_phantom
+from tetopt.system import budget, incoming
+from tetopt.system.incoming import json_of, text_of, toml_of
 
 POINTS = struct.pack("<12d", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
 PACKED = zlib.compress(POINTS)

@@ -14,9 +14,9 @@ from tetopt.cli import mesh as cli_mesh
 from tetopt.cli import predict as cli_predict
 from tetopt.engine import cost
 from tetopt.engine.cost import RunSize
-from tetopt.interpreter import python_command, python_environment
 from tetopt.job import predict
 from tetopt.job.plan import plan
+from tetopt.system.interpreter import python_command, python_environment
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
 from tetopt.engine.paper import optimize_paper
 from tetopt.image import Image
-from tetopt.io.files import save_json
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary, versions
 from tetopt.start.lattice import lattice_mesh
+from tetopt.system.files import save_json
 
 AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
 

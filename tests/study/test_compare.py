@@ -16,7 +16,6 @@ from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
-from tetopt.io.work_directory import create
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.laws import parse_law
 from tetopt.report.figures import save_figure
@@ -25,6 +24,7 @@ from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Attempt, ImageSource, LabelSource, Settings, as_json, from_json
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
+from tetopt.system.work_directory import create
 
 REFERENCE_DOFS = 2000
 SMALL = ["--nodes", "400", "--repeats", "2", "--reference-dofs", str(REFERENCE_DOFS)]

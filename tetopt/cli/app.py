@@ -16,13 +16,13 @@ from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 import tetopt
-from tetopt.budget import check_addresses
 from tetopt.cli.console import log, open_streams, out, settle_streams, show_error, show_event, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
 from tetopt.errors import InputError, error_words
-from tetopt.interpreter import THREADS_NAME
-from tetopt.io.files import Outputs, outputs_of_command
 from tetopt.job.events import listened
+from tetopt.system.budget import check_addresses
+from tetopt.system.files import Outputs, outputs_of_command
+from tetopt.system.interpreter import THREADS_NAME
 
 # In the order of the help, with the modules that have NAME_command: only that of the command that runs is loaded.
 COMMANDS = {

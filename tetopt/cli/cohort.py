@@ -13,7 +13,6 @@ import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from tetopt.budget import memory_words
 from tetopt.cli.console import log, out, show_error, show_event
 from tetopt.cluster.crew import counted
 from tetopt.cluster.workers import local_share
@@ -25,6 +24,7 @@ from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.subjects import Problems
 from tetopt.job.events import Event, listened
 from tetopt.job.options import RunOptions
+from tetopt.system.budget import memory_words
 
 
 def cohort_command(

@@ -14,7 +14,6 @@ from rich.table import Table
 
 import tetopt
 from tetopt import Image, InputError, save_mesh
-from tetopt.budget import BYTES_PER_GB
 from tetopt.cli.console import log, out, print_wide, say
 from tetopt.cli.options import (
     AverageOption,
@@ -24,7 +23,6 @@ from tetopt.cli.options import (
     NumberOptions,
     option,
 )
-from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.inputs import checked_outputs, label_table, read_labels, read_volume
@@ -41,6 +39,8 @@ from tetopt.study.compare_headline import Headline, headline
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.study.program import Program, parse_program
+from tetopt.system.budget import BYTES_PER_GB
+from tetopt.system.files import checked_output, results_folder, save_json
 
 ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-Otsu).", min=2)]
 

@@ -11,11 +11,11 @@ from rich.markup import escape
 from tetopt.cli.console import out, show_event
 from tetopt.cli.options import MeshArgument, NumberOptions, option
 from tetopt.cli.solver import print_model
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
 from tetopt.job.options import LabelledPart, SolverOptions
+from tetopt.system.files import checked_output, save_json
 
 
 def convert_command(

@@ -14,12 +14,12 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import print_wide
 from tetopt.cli.options import NumberOptions, option
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions
 from tetopt.job.solve import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.model.laws import ByLabel, parse_any_law
 from tetopt.report.tables import new_table, nodes_in_words
+from tetopt.system.files import checked_output, save_json
 
 SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 

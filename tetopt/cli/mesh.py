@@ -14,7 +14,6 @@ from tetopt.cli.options import ForceOption, PredictOption, option
 from tetopt.cli.predict import print_parts, print_prediction
 from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
-from tetopt.io.files import results_folder
 from tetopt.io.mni import mni_path
 from tetopt.job.events import listened
 from tetopt.job.job import Job
@@ -24,6 +23,7 @@ from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
+from tetopt.system.files import results_folder
 
 
 def mesh_command(job: Job, predict: PredictOption = False) -> int:

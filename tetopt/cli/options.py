@@ -19,7 +19,6 @@ from typer.models import OptionInfo
 
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
 from tetopt.errors import InputError
-from tetopt.io.files import checked_output, name_files
 from tetopt.job.options import (
     AVERAGE_OPTION,
     IMAGE_FILES,
@@ -31,6 +30,7 @@ from tetopt.job.options import (
     option_name,
 )
 from tetopt.public import LARGEST_INTEGER
+from tetopt.system.files import checked_output, name_files
 
 
 def option(metavar: str | None, text: str, *names: str, **more: Any) -> Any:

@@ -12,9 +12,9 @@ from rich.markup import escape
 from tetopt import Image, InputError, load_phantom, save_image
 from tetopt.cli.console import out
 from tetopt.cli.options import ForceOption, option
-from tetopt.io.files import checked_output
 from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
+from tetopt.system.files import checked_output
 
 
 def phantom_command(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numba
 
-from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
 from tetopt.cli.console import log, out, show_warning
 from tetopt.cluster.crew import Need, counted
 from tetopt.engine.cost import calibrated_speed, cost_model, predicted
 from tetopt.job.task import Task
 from tetopt.start.octree import OCTREE_NODE_BYTES
+from tetopt.system.budget import BYTES_PER_GB, available_bytes, memory_words
 
 
 def print_prediction(task: Task) -> None:

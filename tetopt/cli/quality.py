@@ -11,12 +11,12 @@ from rich.table import Table
 
 from tetopt.cli.console import out, print_fidelity
 from tetopt.cli.options import NumberOptions, option
-from tetopt.io.files import save_json
 from tetopt.job.judge import Judgement, judge
 from tetopt.job.options import ImagePart, LabelNamesOption
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
 from tetopt.report.tables import add_quality, new_table
+from tetopt.system.files import save_json
 
 
 def quality_command(

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tetopt.budget import memory_words, resident_bytes
 from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
 from tetopt.cluster.crew import counted
 from tetopt.engine.loop import IterationRecord
 from tetopt.job.events import Event, Stage
 from tetopt.job.in_parts import PartsProgress
+from tetopt.system.budget import memory_words, resident_bytes
 
 LINE_SECONDS = 10.0  # between lines, where there is no terminal to show a bar on
 

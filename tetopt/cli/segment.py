@@ -14,10 +14,10 @@ from tetopt import Image, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
 from tetopt.cli.options import ImageArgument, NumberOptions, option
 from tetopt.energy.sampling import overlap_of
-from tetopt.io.files import checked_output, save_json
 from tetopt.job.inputs import read_image, read_labels, read_mesh, warn_of_other_image
 from tetopt.job.options import ImagePart
 from tetopt.report.tables import new_table
+from tetopt.system.files import checked_output, save_json
 
 
 def segment_command(

@@ -9,10 +9,10 @@ from rich.markup import escape
 
 from tetopt.cli.console import out
 from tetopt.cli.options import MeshArgument, NumberOptions, option
-from tetopt.io.files import checked_output, save_json
 from tetopt.io.surfaces import SURFACE_SUFFIXES
 from tetopt.job.surface import SurfacePart, write_surface
 from tetopt.report.tables import new_table
+from tetopt.system.files import checked_output, save_json
 
 
 def surface_command(

@@ -17,13 +17,13 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import out
 from tetopt.cli.options import ForceOption, ShownOptions, option
-from tetopt.incoming import json_of
-from tetopt.io.files import checked_output
 from tetopt.job.inputs import label_table, number_of, read_image, read_mesh, warn_of_other_image
 from tetopt.job.options import BoxPart
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
+from tetopt.system.files import checked_output
+from tetopt.system.incoming import json_of
 
 
 def view_command(

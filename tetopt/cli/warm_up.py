@@ -8,12 +8,12 @@ import numpy as np
 from rich.markup import escape
 
 from tetopt import Image, InputError, cell_fields, label_fidelity, mask_fidelity, mesh_image
-from tetopt.cache import place_cache
 from tetopt.cli.console import out
 from tetopt.cli.run import compiling
 from tetopt.contents.content import content
 from tetopt.fem.reference import reference
-from tetopt.kernels import link, roots
+from tetopt.system.cache import place_cache
+from tetopt.system.kernels import link, roots
 
 BALL_VOXELS = 24  # along each axis of the image that is meshed: an octree of 300 nodes needs as many
 BALL_NODES = {2: 60, 3: 300}  # by its axes

@@ -11,8 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.budget import memory_words
 from tetopt.errors import InputError
+from tetopt.system.budget import memory_words
 from tetopt.system.child import end_with_parent, limit_self
 
 MEMORY_MARGIN = 1.35  # of a task's memory over its prediction, which may be 25 % too low: 1 / 0.75

@@ -18,7 +18,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.budget import memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
     WITHIN_SETTINGS,
@@ -32,8 +31,9 @@ from tetopt.cluster.crew import (
     limiter,
 )
 from tetopt.errors import InputError
-from tetopt.incoming import text_of
-from tetopt.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
+from tetopt.system.budget import memory_words
+from tetopt.system.incoming import text_of
+from tetopt.system.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
 YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
 YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000

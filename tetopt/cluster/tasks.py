@@ -15,10 +15,10 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple, NoReturn
 
-from tetopt.budget import memory_words, peak_bytes
 from tetopt.cluster.crew import Workers
 from tetopt.errors import InputError
 from tetopt.io.text import plain
+from tetopt.system.budget import memory_words, peak_bytes
 
 WAIT_SECONDS = 1.0  # between two looks at the workers, which come and go
 LAST_SECONDS = 60.0  # for tasks that run when the others are given up, most of which have the better part behind them

@@ -20,7 +20,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.budget import available_bytes, memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
     About,
@@ -35,8 +34,9 @@ from tetopt.cluster.crew import (
 )
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
-from tetopt.interpreter import THREADS_NAME, safe_path
+from tetopt.system.budget import available_bytes, memory_words
+from tetopt.system.extras import install_hint
+from tetopt.system.interpreter import THREADS_NAME, safe_path
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5

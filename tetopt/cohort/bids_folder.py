@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 from tetopt.cohort.layout import DESCRIPTION_NAME
 from tetopt.cohort.subjects import Problems, Subject
 from tetopt.errors import InputError, warn
-from tetopt.extras import install_hint
-from tetopt.incoming import json_of, text_of
 from tetopt.io.text import plain
+from tetopt.system.extras import install_hint
+from tetopt.system.incoming import json_of, text_of
 
 BIDS_ENDINGS = (".nii.gz", ".nii")  # that of two with one name which is read comes first
 RAW_PLACE = "sub-[^/]+/(ses-[^/]+/)?(?!ses-)[^/]+/[^/]+"

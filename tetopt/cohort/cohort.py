@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.budget import memory_words
 from tetopt.cluster.crew import counted
 from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cluster.workers import Folders, check_choice, workers
@@ -42,10 +41,11 @@ from tetopt.cohort.schedule import run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.engine.cost import Prediction
 from tetopt.errors import InputError
-from tetopt.io.files import checked_output
 from tetopt.job.events import Listener, listened, note, progress, started, violated, warning
 from tetopt.job.job import in_kinds
 from tetopt.job.options import RunOptions, kinds_of, near_hint
+from tetopt.system.budget import memory_words
+from tetopt.system.files import checked_output
 
 NAMED_FAILURES = 20  # in words: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most

@@ -9,7 +9,6 @@ from dataclasses import fields
 from io import StringIO
 from typing import NamedTuple
 
-from tetopt.budget import available_bytes
 from tetopt.cluster.workers import Need
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.plan import PlannedSubject
@@ -20,6 +19,7 @@ from tetopt.job.events import listened
 from tetopt.job.options import SizeOptions
 from tetopt.job.predict import size_by_headers
 from tetopt.job.read import read_planned
+from tetopt.system.budget import available_bytes
 
 LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
 

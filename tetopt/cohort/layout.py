@@ -5,7 +5,7 @@ OUT/cohort.tsv, cohort.html                    all subjects
 OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     and the numbers of the run beside it, in a file of the same name in JSON
 OUT/sub-X[/ses-Y]/figures/                     its pictures
 OUT/logs/KEY.log, KEY.failed.json              what the last run said, and why it failed
-OUT/.work/                                     what is under way (`tetopt.io.work_directory`)
+OUT/.work/                                     what is under way (`tetopt.system.work_directory`)
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from typing import Any
 
 import tetopt
 from tetopt.errors import InputError
-from tetopt.incoming import irregular, json_of, own_bytes, text_of
-from tetopt.io.files import save_json
-from tetopt.io.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check_files, create, opened
+from tetopt.system.files import save_json
+from tetopt.system.incoming import irregular, json_of, own_bytes, text_of
+from tetopt.system.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check_files, create, opened
 
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"

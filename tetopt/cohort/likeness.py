@@ -12,8 +12,8 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from tetopt.incoming import own_bytes
 from tetopt.report.thumbnail import SIDE_PIXELS
+from tetopt.system.incoming import own_bytes
 
 BLOCK_PIXELS = 4  # that are averaged along each side: the mesh's edges, which lie anywhere, are hardly seen then
 MEDIAN_PICTURES = 1000  # of which the median is taken, evenly many of all: more change it by a hundredth

@@ -28,9 +28,9 @@ from tetopt.cohort.layout import (
 )
 from tetopt.cohort.likeness import likenesses
 from tetopt.geometry.box import world_axes
-from tetopt.incoming import toml_of
-from tetopt.io.files import save_json, written_whole
 from tetopt.io.text import plain
+from tetopt.system.files import save_json, written_whole
+from tetopt.system.incoming import toml_of
 
 Status = Literal["done", "missed", "failed", "missing"]
 Value = float | int | str | bool | None

@@ -17,9 +17,9 @@ from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
 from tetopt.errors import InputError
-from tetopt.incoming import own_bytes
 from tetopt.model.labels import label_words
 from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
+from tetopt.system.incoming import own_bytes
 
 PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
 PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjects the flagged ones, and a sample

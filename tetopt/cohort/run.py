@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from tetopt.budget import peak_bytes
 from tetopt.cohort.layout import (
     FIGURES_NAME,
     WORK_NAME,
@@ -23,10 +22,11 @@ from tetopt.cohort.layout import (
     publish,
     subject_folder,
 )
-from tetopt.interpreter import python_command, python_environment
-from tetopt.io.files import save_json, save_text
 from tetopt.study.endings import last_line
+from tetopt.system.budget import peak_bytes
 from tetopt.system.child import signal_words, started, watched
+from tetopt.system.files import save_json, save_text
+from tetopt.system.interpreter import python_command, python_environment
 
 LOOK_SECONDS = 0.2  # between two looks at a run: a hundredth of the shortest that is meant
 MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find the memory that the first did not

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tetopt.budget import memory_words
 from tetopt.cluster.tasks import is_lost, lost_words, outcomes
 from tetopt.cohort.run import MOST_ATTEMPTS, Ended, SubjectTask, run_subject, set_down
 from tetopt.study.endings import last_line
+from tetopt.system.budget import memory_words
 
 
 def run_all(

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.incoming import text_of
-from tetopt.io.files import save_text
 from tetopt.model.laws import LAW_OPTIONS, law_file
+from tetopt.system.files import save_text
+from tetopt.system.incoming import text_of
 
 TABLE_SUFFIXES = (".tsv", ".csv")
 SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is BIDS's

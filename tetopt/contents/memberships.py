@@ -17,10 +17,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.contents.labels import check_labels, label_channels
 from tetopt.image import Image
-from tetopt.kernel_cache import njit
+from tetopt.system.budget import check_memory
+from tetopt.system.kernel_cache import njit
 
 PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
 NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.contents.noise import NoiseSample, noise_places, sampled_noise
 from tetopt.image import Image, check_finite, check_intensities, check_kind, pieces
+from tetopt.system.budget import check_memory
 
 # Of the noise's planes, of each voxel: three times as doubles, and what second differences of them are made of.
 NOISE_PLANE_BYTES = 120.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points, squared_edges, volume_gradients, volumes
 from tetopt.geometry.vectors import cross, difference, dot
-from tetopt.kernel_cache import njit
+from tetopt.system.kernel_cache import njit
 
 
 def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:

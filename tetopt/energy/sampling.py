@@ -30,14 +30,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.contents.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
-from tetopt.kernel_cache import njit
-from tetopt.kernels import (
+from tetopt.mesh import Mesh
+from tetopt.system.budget import check_memory
+from tetopt.system.kernel_cache import njit
+from tetopt.system.kernels import (
     Floats1,
     Floats2,
     Floats3,
@@ -53,7 +54,6 @@ from tetopt.kernels import (
     run,
     unit,
 )
-from tetopt.mesh import Mesh
 
 EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends an edge's cut is known to far less than the rest of 0.5
 SUM_BYTES = 12.0  # of each prefix sum at a voxel: 8, and temporary arrays

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume, few_threads
 from tetopt.energy.sampling import put_flux as sampled_flux
 from tetopt.geometry.vectors import cross, difference, dot, minus, over, put_row, scaled, times
-from tetopt.kernels import (
+from tetopt.system.kernels import (
     Bools2,
     Floats1,
     Floats2,

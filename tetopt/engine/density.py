@@ -64,8 +64,8 @@ from tetopt.engine.smooth import (
 )
 from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, ring_faces_up, uphill_at
 from tetopt.geometry.vectors import dot, minus, put_row, row
-from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 from tetopt.start.sizes import LONG_EDGE
+from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 
 # Of a node's mean share of E: splits worth less are not looked for. The last one made in a round is worth 0.4 to 0.8.
 LEAST_SPLIT_SHARE = 0.2

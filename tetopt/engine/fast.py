@@ -44,12 +44,12 @@ from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
-from tetopt.kernels import link, roots
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
 from tetopt.start.carve import carved
 from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
+from tetopt.system.kernels import link, roots
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
 HOPE_SHARE = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved
@@ -249,8 +249,8 @@ def prepare_kernels(
 ) -> None:  # fmt: skip
     """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
 
-    Several processes compile what the cache does not hold, of which `progress` is told as by `tetopt.kernels.link`; a
-    tiny run then loads what is left.
+    Several processes compile what the cache does not hold, of which `progress` is told as by
+    `tetopt.system.kernels.link`; a tiny run then loads what is left.
     """
     content = plain(image)
     image = content.image

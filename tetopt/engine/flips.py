@@ -43,7 +43,7 @@ from tetopt.engine.complex import (
     worst_cosine,
 )
 from tetopt.geometry.vectors import cross, difference, dot, row
-from tetopt.kernels import (
+from tetopt.system.kernels import (
     Bools1,
     Bools2,
     Bools3,

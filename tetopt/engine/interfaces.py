@@ -21,8 +21,8 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.kernels import Floats1, Ints1, entry, helper, unit
 from tetopt.mesh import Mesh
+from tetopt.system.kernels import Floats1, Ints1, entry, helper, unit
 
 RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
 LEAST_RELABELLING_SHARE = 1e-9  # of the energies weighed: a smaller gain may be rounding

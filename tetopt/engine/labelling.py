@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
 from tetopt.geometry.topology import rings
-from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
+from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_SHARE = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own

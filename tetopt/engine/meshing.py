@@ -17,7 +17,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tetopt.budget import check_memory
 from tetopt.contents.content import Content, plain
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import optimize
@@ -41,6 +40,7 @@ from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
+from tetopt.system.budget import check_memory
 
 Mode = Literal["graded", "uniform", "paper", "start"]
 Run = Callable[..., MeshingResult]  # an optimisation that is ready to begin; takes further options of `optimize`

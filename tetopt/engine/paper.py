@@ -32,10 +32,10 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.topology import facets, folded, greedy_colours
 from tetopt.image import Image
-from tetopt.kernels import packed
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
 from tetopt.start.delaunay import delaunay
+from tetopt.system.kernels import packed
 
 Retessellate = Literal["first", "accept", "never"]
 

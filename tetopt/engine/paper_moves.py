@@ -18,7 +18,7 @@ from tetopt.engine.complex import FLAT_SHARE, NodeRings, State, cell_energy
 from tetopt.engine.smooth import Trial, TrialByValue, ring_image, store, trial_of
 from tetopt.engine.surface import projection_at
 from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
-from tetopt.kernels import Floats2, Ints1, helper, run, unit
+from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 
 LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy: then the node stays
 

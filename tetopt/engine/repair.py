@@ -43,7 +43,7 @@ from tetopt.engine.flips import (
 from tetopt.engine.smooth import ring_energy, slid, store, trial_of
 from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
-from tetopt.kernels import Floats1, Floats2, Ints1, entry, helper, unit
+from tetopt.system.kernels import Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
 STEP_HALVINGS = 7  # of a node's displacement

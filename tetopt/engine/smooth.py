@@ -55,7 +55,7 @@ from tetopt.engine.surface import (
 )
 from tetopt.geometry.topology import greedy_colours
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
-from tetopt.kernels import (
+from tetopt.system.kernels import (
     Bools1,
     Floats1,
     Floats2,

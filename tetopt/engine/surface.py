@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tetopt.contents.domain import ON_SURFACE_VOXELS
 from tetopt.engine.complex import NodeRings, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
-from tetopt.kernels import Floats2, Singles3, entry, helper, unit
+from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
 CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there

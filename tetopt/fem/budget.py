@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import available_bytes
 from tetopt.errors import InputError
 from tetopt.fem.reference import DOF_BYTES, averaged, reference
 from tetopt.fem.voxels import Grid, grid_of, multigrid_of, preconditioned, stiffness_product
 from tetopt.image import Image
+from tetopt.system.budget import available_bytes
 
 STEP_GROWTH = 1.02  # between voxel sizes that are tried for the reference's grid: it misses the limit by under 6 %
 TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take hardly more

@@ -30,7 +30,6 @@ from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_arra
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from tetopt.budget import check_memory
 from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
@@ -40,6 +39,7 @@ from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.laws import checked_young
+from tetopt.system.budget import check_memory
 
 Method = Literal["auto", "direct", "amg"]
 Arguments = ParamSpec("Arguments")

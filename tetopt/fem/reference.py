@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from tetopt.budget import check_memory
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
@@ -32,6 +31,7 @@ from tetopt.geometry.box import upright_axis
 from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.budget import check_memory
 
 # Of memory, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million.
 DOF_BYTES = 100

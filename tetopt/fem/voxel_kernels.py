@@ -19,7 +19,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import few_threads
-from tetopt.kernel_cache import njit
+from tetopt.system.kernel_cache import njit
 
 CHUNK_VOXELS = 128  # of a row at once: 48 rows of them stay in the first cache
 SLAB_PLANES = 4  # a plane in this many is written by two slabs; more planes leave threads idle at the end

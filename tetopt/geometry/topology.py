@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
-from tetopt.kernel_cache import njit
+from tetopt.system.kernel_cache import njit
 
 
 class Rings(NamedTuple):

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.incoming import regular_file
 from tetopt.io.tags import check_apart, named_materials, without_data
 from tetopt.io.text import blocks, comment_lines, plain, rows
 from tetopt.mesh import Mesh
@@ -19,6 +18,7 @@ from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load
 from tetopt.model.materials import Materials, cells_of, without_moduli
 from tetopt.model.model import Model, described, element_facets, elements, mass_densities
 from tetopt.model.sets import Sets
+from tetopt.system.incoming import regular_file
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells

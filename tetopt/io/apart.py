@@ -24,10 +24,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import address_bytes
 from tetopt.errors import InputError
-from tetopt.interpreter import python_command, python_environment
+from tetopt.system.budget import address_bytes
 from tetopt.system.child import limit_self, signal_words, started
+from tetopt.system.interpreter import python_command, python_environment
 
 LEAST_BYTES = 2**31  # of memory for any file, libraries loaded: their buffers and the largest small file
 BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfold, zlib on meshes tenfold

@@ -129,7 +129,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
     has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
     become the same are numbered, and a warning tells what changed. Replaces an
-    existing file; ask `tetopt.io.files.checked_output` first.
+    existing file; ask `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def save_mesh(
     Points in world mm (RAS+), cells positively oriented, of order 1 or 2, `cell_data` and `point_data` by name, the
     latter with a row for each mesh point or for each node of order 2; in VTK's formats each entry of `about` becomes a
     field-data text, as JSON unless it is a string already. `save_model` writes sets, materials and loads, too. Replaces
-    an existing file; ask `tetopt.io.files.checked_output` first.
+    an existing file; ask `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------

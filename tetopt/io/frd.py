@@ -16,16 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory, memory_words
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.fem.solution import von_mises
 from tetopt.geometry.quadratic import quadratic
-from tetopt.incoming import regular_file
 from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, stresses_times
 from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
+from tetopt.system.budget import check_memory, memory_words
+from tetopt.system.extras import install_hint
+from tetopt.system.incoming import regular_file
 
 # Relative, of a coordinate: half a unit of the sixth digit, which is the last that CalculiX writes, is 5e-6 at most.
 WRITTEN_DIGITS = 6e-6

@@ -27,9 +27,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError, warn
 from tetopt.image import Image
-from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.files import check_suffix, written_whole
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
@@ -43,6 +41,8 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
+from tetopt.system.files import check_suffix, written_whole
+from tetopt.system.incoming import irregular
 
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
@@ -201,7 +201,7 @@ def save_image(path: str | Path, image: Image) -> None:
     than NIfTI-1 can number makes it a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
-    existing file; ask `tetopt.io.files.checked_output` first. A folder of Zarr (.zarr), of a 3-D image, is
+    existing file; ask `tetopt.system.files.checked_output` first. A folder of Zarr (.zarr), of a 3-D image, is
     `tetopt.io.zarr_images.save_zarr`'s, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
 
     Parameters
@@ -216,7 +216,7 @@ def save_image(path: str | Path, image: Image) -> None:
     InputError
         A name that ends otherwise; as `save_zarr`.
     OSError
-        As `tetopt.io.files.written_whole`, or the file reads back with another head or cut off.
+        As `tetopt.system.files.written_whole`, or the file reads back with another head or cut off.
 
     Examples
     --------

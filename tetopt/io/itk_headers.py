@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room
+from tetopt.system.incoming import irregular
 
 HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers are read here
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
-from tetopt.incoming import text_of
 from tetopt.model.labels import NO_TABLE, LabelTable
+from tetopt.system.incoming import text_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 

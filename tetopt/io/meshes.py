@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from tetopt.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, rows_by_kind, simplices_of
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
-from tetopt.incoming import regular_file
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
@@ -23,6 +22,7 @@ from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.file import MeshFile, text_in
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
+from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
 STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits

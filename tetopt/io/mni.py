@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.image import Image
 from tetopt.io.images import load_image
+from tetopt.system.extras import install_hint
 
 
 def mni_path(contrast: Literal["t1", "gm", "wm"]) -> Path:

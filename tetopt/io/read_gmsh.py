@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory, memory_words
 from tetopt.conversions import CELL_DIMENSIONS
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
 from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
+from tetopt.system.budget import check_memory, memory_words
 
 if TYPE_CHECKING:
     import meshio

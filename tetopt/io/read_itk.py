@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
-from tetopt.incoming import irregular
 from tetopt.io.apart import read_apart
 from tetopt.io.itk_headers import checked_header
 from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
+from tetopt.system.extras import install_hint
+from tetopt.system.incoming import irregular
 
 # ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
 ITK_READERS = {

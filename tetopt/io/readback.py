@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from tetopt.io.files import written_whole
+from tetopt.system.files import written_whole
 
 COMPARED_BYTES = 2**24  # of the file and of what was written, at a time: so much more memory
 
@@ -16,7 +16,7 @@ def save_checked(path: Path, whole: bytes) -> None:
     Raises
     ------
     OSError
-        As `tetopt.io.files.written_whole`; the file has other bytes.
+        As `tetopt.system.files.written_whole`; the file has other bytes.
     """
     with written_whole(path, len(whole)) as temporary:
         temporary.write_bytes(whole)

@@ -53,7 +53,7 @@ def save_surface(
 
     The header says the coordinates' convention in the words that 3D Slicer looks for. All but STL, which rounds to
     float32, hold every bit of the points and their order. Replaces an existing file; ask
-    `tetopt.io.files.checked_output` first.
+    `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.errors import InputError
+from tetopt.system.budget import check_memory
 
 IMAGE_BYTES = 8  # of a voxel of an `Image`, at most
 # What to do about a file that ends too soon, and about one that may never have been an image.

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from tetopt.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.image import Image
-from tetopt.incoming import json_of
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
@@ -36,6 +35,7 @@ from tetopt.model.file import text_in
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, elements, grid_fields
 from tetopt.model.sets import SET_NAME, Box, Sets
+from tetopt.system.incoming import json_of
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkUnstructuredGrid

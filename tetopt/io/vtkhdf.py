@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from tetopt.conversions import VTK_KINDS
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
 from tetopt.io.raw import RawGrid
 from tetopt.io.read_vtk import checked_grid, plain_arrays
 from tetopt.io.text import plain, short_name
 from tetopt.io.vtk import model_grid
 from tetopt.model.model import Model
+from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:
     import h5py

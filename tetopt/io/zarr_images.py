@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tetopt.budget import check_memory
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.image import Image, checked_affine
-from tetopt.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
-from tetopt.io.files import folder_written_whole
 from tetopt.io.text import plain
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
 from tetopt.io.zarr_codecs import PACKERS, bounded
+from tetopt.system.budget import check_memory
+from tetopt.system.extras import install_hint
+from tetopt.system.files import folder_written_whole
+from tetopt.system.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 
 ZARR_SUFFIX = ".zarr"
 NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
@@ -150,7 +150,7 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     Parameters
     ----------
     path : Path
-        Replaces a folder of Zarr's that is there; ask `tetopt.io.files.checked_output` first.
+        Replaces a folder of Zarr's that is there; ask `tetopt.system.files.checked_output` first.
     image : Image
         Whose place they have, three-dimensional.
     voxels : Any
@@ -168,7 +168,7 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     InputError
         zarr is not installed; not three axes; values beyond the dtype's.
     OSError
-        As `tetopt.io.files.folder_written_whole`.
+        As `tetopt.system.files.folder_written_whole`.
     """
     zarr = _library()
     if image.ndim != 3:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import tetopt
-from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
 from tetopt.cluster.crew import Folders, Need, Workers, counted
 from tetopt.cluster.tasks import run_tasks
 from tetopt.cluster.workers import check_choice, local_share, workers
@@ -43,6 +42,7 @@ from tetopt.parts.division import Division, work_folder
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, mesh_in_parts
 from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, identity, removed
+from tetopt.system.budget import BYTES_PER_GB, available_bytes, memory_words
 
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of

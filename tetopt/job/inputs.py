@@ -16,7 +16,6 @@ from tetopt.contents.align import is_same_grid, resample_contrast
 from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.io.files import checked_output
 from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table
 from tetopt.io.meshes import load_mesh
@@ -25,6 +24,7 @@ from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
+from tetopt.system.files import checked_output
 
 IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 UNNAMED_LISTED = 8  # of those that have no name: a line's worth

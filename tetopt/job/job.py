@@ -14,11 +14,11 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tetopt.errors import InputError
-from tetopt.incoming import json_of
 from tetopt.job.options import JobOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
 from tetopt.model.laws import LAW_OPTIONS
 from tetopt.public import LARGEST_INTEGER
+from tetopt.system.incoming import json_of
 
 Record = TypeVar("Record")
 MOST_SAID = 80  # letters of a value in a message

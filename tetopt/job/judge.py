@@ -12,7 +12,6 @@ from tetopt.check import check_mesh, manifold_problems
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
-from tetopt.incoming import json_of
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
 from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image
@@ -23,6 +22,7 @@ from tetopt.measure.quality import Quality, quality
 from tetopt.measure.requirements import judged
 from tetopt.model.file import MeshFile
 from tetopt.report.summary import fidelity, size_summary
+from tetopt.system.incoming import json_of
 
 
 class Judgement(NamedTuple):

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_SHARE
 from tetopt.engine.cost import next_bytes
@@ -27,7 +26,6 @@ from tetopt.engine.meshing import (
 )
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
-from tetopt.io.files import check_space
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early
@@ -39,6 +37,8 @@ from tetopt.job.write import model_with
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
+from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
+from tetopt.system.files import check_space
 
 CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
 LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded

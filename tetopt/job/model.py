@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 import tetopt
 from tetopt.errors import InputError, error_words
 from tetopt.image import Image
-from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning
@@ -50,6 +49,7 @@ from tetopt.model.sets import (
     parse_set,
     standard_names,
 )
+from tetopt.system.files import kept_places
 
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces that hold sets
 SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has

@@ -14,7 +14,6 @@ from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
 from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
-from tetopt.io.files import checked_output, results_folder
 from tetopt.io.formats import FORMATS
 from tetopt.io.images import parse_crop, parse_slice
 from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
@@ -25,6 +24,7 @@ from tetopt.parts.work import VolumeFile
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
+from tetopt.system.files import checked_output, results_folder
 
 FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
 

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from tetopt.engine.loop import MeshingResult
 from tetopt.geometry.quadratic import node_count
-from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
 from tetopt.job.events import Listener, listened, violated
 from tetopt.job.in_parts import end_parts
@@ -22,6 +21,7 @@ from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.summary import measured_each, model_summary
+from tetopt.system.files import save_json
 
 
 class Result(NamedTuple):

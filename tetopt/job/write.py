@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import peak_bytes
 from tetopt.contents.content import continued
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import QUADRATIC_NODES
-from tetopt.io.files import TakenError
 from tetopt.job.events import note
 from tetopt.job.inputs import label_table
 from tetopt.job.model import (
@@ -38,6 +36,8 @@ from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, image_summary, measured_each, run_summary
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
+from tetopt.system.budget import peak_bytes
+from tetopt.system.files import TakenError
 
 
 def model_with(

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt import notebook
-from tetopt.incoming import json_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
 from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words
@@ -18,6 +17,7 @@ from tetopt.model.loads import load_words, parse_load
 from tetopt.model.materials import BinningError
 from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
 from tetopt.model.sets import Box, Sets, label_sets, merged_sets, standard_sets
+from tetopt.system.incoming import json_of
 
 MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # of cells of a file of ours
 MODULUS_ROUNDING = 1e-9  # relative: of a cell's modulus beside those at its Gauss points, in files of other units

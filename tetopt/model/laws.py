@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.incoming import text_of, toml_of
 from tetopt.model.formula import parse_formula
+from tetopt.system.incoming import text_of, toml_of
 
 LAW_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a law
 LAW_SUFFIXES = (".toml", ".csv")  # of files that a law's text may name

@@ -7,7 +7,7 @@ round-R/part-P.npz            what a part of the next round is to be made of
 round-R/done-P.npz            and what came of it
 logs/                         what dask and a batch system's jobs say
 
-`tetopt.io.work_directory` says what else may not lie there.
+`tetopt.system.work_directory` says what else may not lie there.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.incoming import json_of, own_bytes
-from tetopt.io.files import save_json, written_whole
 from tetopt.io.images import Bounds
 from tetopt.io.stored_images import open_stored, stored_checksum
 from tetopt.io.text import plain
-from tetopt.io.work_directory import LOCK_NAME, Layout, create, discard, opened
+from tetopt.system.files import save_json, written_whole
+from tetopt.system.incoming import json_of, own_bytes
+from tetopt.system.work_directory import LOCK_NAME, Layout, create, discard, opened
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
 LOGS_NAME = "logs"

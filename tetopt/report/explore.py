@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from tetopt.fem.reference import averaged
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
-from tetopt.io.files import save_text
 from tetopt.io.text import plain
 from tetopt.report.colours import grey_limits
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.page import data_html, packed, policy_html, printed, script_html
+from tetopt.system.files import save_text
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
 PAGE_SIDE_VOXELS = 2048  # along an axis of it: what nearly every graphics card takes
@@ -36,7 +36,7 @@ def colour_table() -> NDArray[np.uint8]:
 def save_explorer(path: str | Path, shown: Exhibit) -> None:
     """Write `explorer_html` as one file, whole or not at all.
 
-    Replaces an existing file; ask `tetopt.io.files.checked_output` first.
+    Replaces an existing file; ask `tetopt.system.files.checked_output` first.
     """
     save_text(path, explorer_html(shown))
 

@@ -24,12 +24,12 @@ from tetopt.geometry.cut import plane_cut, triangle_cut
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.io.files import check_suffix, written_whole
 from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
+from tetopt.system.files import check_suffix, written_whole
 
 matplotlib.use("agg")
 FIGURE_SUFFIXES = (".png",)

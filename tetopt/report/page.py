@@ -15,8 +15,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from tetopt.io.files import save_text
 from tetopt.io.text import plain
+from tetopt.system.files import save_text
 
 # Of pages: the files beside this one that each is made of.
 PAGE_SCRIPTS = {

@@ -15,12 +15,12 @@ from scipy import ndimage
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.io.files import check_suffix, written_whole
 from tetopt.mesh import Mesh
 from tetopt.report.colours import LISTED_LABELS, grey_limits, plain_text
 from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
 from tetopt.report.viewer import View
+from tetopt.system.files import check_suffix, written_whole
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above

@@ -23,11 +23,11 @@ from tetopt.geometry.cut import plane_cut, triangle_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.io.files import check_suffix, save_bytes
 from tetopt.mesh import Mesh
 from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
+from tetopt.system.files import check_suffix, save_bytes
 
 SIDE_PIXELS = 128  # of a view: a head is seen, a page has 500 of them
 SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would flicker in single samples

@@ -19,11 +19,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.budget import check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
 KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first

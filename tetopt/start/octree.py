@@ -23,7 +23,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.budget import check_memory
 from tetopt.contents.content import Content, plain
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -42,6 +41,7 @@ from tetopt.start.sizes import (
     equilateral_nodes,
 )
 from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
+from tetopt.system.budget import check_memory
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
 ROOT_SHARES = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))

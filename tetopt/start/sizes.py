@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.image import Image
-from tetopt.kernel_cache import njit
 from tetopt.start.lattice import near_cubes
+from tetopt.system.kernel_cache import njit
 
 # A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set
 # (`docs/understand/sizes.md`).

@@ -19,7 +19,7 @@ from tetopt.contents.noise import NoiseSample, noise_sample, sampled_noise
 from tetopt.contents.statistics import mean_of, row_sums, statistics
 from tetopt.errors import InputError
 from tetopt.image import Box, pieces
-from tetopt.kernel_cache import njit
+from tetopt.system.kernel_cache import njit
 
 
 class Channels(NamedTuple):

@@ -22,13 +22,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import family_peak_bytes
 from tetopt.errors import InputError
-from tetopt.interpreter import python_command, python_environment
 from tetopt.mesh import Mesh
 from tetopt.study.endings import Crashed, NotInstalled, last_line
 from tetopt.study.pipelines import PipelineInput, Produced
+from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
+from tetopt.system.interpreter import python_command, python_environment
 
 Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": it is not installed
 

@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.extras import pip_install
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
-from tetopt.interpreter import python_command
 from tetopt.mesh import Mesh
 from tetopt.study.endings import NotInstalled, last_line
 from tetopt.study.search import corners_for, is_near, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
 from tetopt.system.child import signal_words
+from tetopt.system.extras import pip_install
+from tetopt.system.interpreter import python_command
 
 CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
 FIRST_SCALING = 2.0  # of features, in the first run: on the coarse side, where runs take the least time

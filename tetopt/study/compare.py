@@ -31,12 +31,9 @@ from tetopt.fem.reference import Reference, averaged, compare, nearest, referenc
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
-from tetopt.incoming import own_bytes, text_of
-from tetopt.io.files import save_json
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
-from tetopt.io.work_directory import LOCK_NAME, Layout, create, opened
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
@@ -72,6 +69,9 @@ from tetopt.study.compare_report import (
 from tetopt.study.pipelines import UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
+from tetopt.system.files import save_json
+from tetopt.system.incoming import own_bytes, text_of
+from tetopt.system.work_directory import LOCK_NAME, Layout, create, opened
 
 Say = Callable[[str], None]
 Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its settings, as JSON has it

@@ -7,7 +7,6 @@ from pathlib import Path
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.io.files import save_json
 from tetopt.measure.segmentation import thresholded
 from tetopt.mesh import Mesh
 from tetopt.report.figures import save_figure
@@ -26,6 +25,7 @@ from tetopt.study.compare_headline import headline
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import Report, as_json
 from tetopt.study.program import pipelines_with
+from tetopt.system.files import save_json
 
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {

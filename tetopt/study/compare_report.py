@@ -246,7 +246,7 @@ def averages_of(settings: Settings) -> tuple[str, ...]:
 
 
 def as_json(value: Any) -> Any:
-    """A record as its file holds it, for `tetopt.io.files.save_json`: objects, lists and what these hold."""
+    """A record as its file holds it, for `tetopt.system.files.save_json`: objects, lists and what these hold."""
     if isinstance(value, dict):
         return {key: as_json(item) for key, item in value.items()}
     if hasattr(value, "_asdict"):

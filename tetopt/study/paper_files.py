@@ -15,7 +15,6 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
-from tetopt.io.files import save_json
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
 from tetopt.phantom import load_phantom
@@ -31,6 +30,7 @@ from tetopt.report.scene import (
 from tetopt.report.summary import versions
 from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
+from tetopt.system.files import save_json
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)

@@ -26,7 +26,6 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.interpreter import others_environment
 from tetopt.io.images import save_image, sha256
 from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
@@ -37,6 +36,7 @@ from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
 from tetopt.system.child import signal_words
+from tetopt.system.interpreter import others_environment
 
 PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
 NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets
@@ -35,6 +34,7 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
+from tetopt.system.extras import install_hint
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
 # Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.

@@ -7,10 +7,10 @@ import pytest
 from attacks import KINDS, content, outside, planted
 
 from tetopt.errors import InputError
-from tetopt.incoming import own_bytes
-from tetopt.io import work_directory
-from tetopt.io.files import save_text
-from tetopt.io.work_directory import Layout, check_files, create, discard, opened
+from tetopt.system import work_directory
+from tetopt.system.files import save_text
+from tetopt.system.incoming import own_bytes
+from tetopt.system.work_directory import Layout, check_files, create, discard, opened
 
 LAYOUT = Layout("a test", r"lock|mesh-\d+\.npz", {r"round-\d+": r"part-\d+\.npz", "scratch": None})
 

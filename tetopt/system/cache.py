@@ -36,7 +36,7 @@ def place_cache() -> Place:
     beside the source, nobody else may write at all (`untrusted`).
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    beside = Path(__file__).parent / "__pycache__"
+    beside = Path(__file__).parents[1] / "__pycache__"
     folders = [Path(chosen)] if chosen else [beside, _user_cache() / "numba"]
     refusals = [(folder, _refusal(folder, is_within=folder == beside)) for folder in folders]
     usable = [folder for folder, refusal in refusals if refusal is None]

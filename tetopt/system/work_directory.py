@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.incoming import KINDS_OF_FILES, UNFOLLOWED, irregular, own_bytes
-from tetopt.io.files import TEMPORARY_LETTERS, save_json
+from tetopt.system.files import TEMPORARY_LETTERS, save_json
+from tetopt.system.incoming import KINDS_OF_FILES, UNFOLLOWED, irregular, own_bytes
 from tetopt.system.lock import HAS_LOCKS, lock_file
 
 HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders: Windows has none
 MANIFEST_NAME, LOCK_NAME = "tetopt-manifest", "lock"
 MANIFEST_BYTES = 10_000  # at most: those that tetopt writes have some 200
-# As `tetopt.io.files.written_whole` names files under way; a killed run leaves them.
+# As `tetopt.system.files.written_whole` names files under way; a killed run leaves them.
 TEMPORARY = re.compile(rf"\.(.{{1,{TEMPORARY_LETTERS}}})\.[a-z0-9_]{{8}}.{{0,20}}")
 # What systems put into folders: files removed while open on NFS, and macOS's Finder.
 SYSTEM_NAMES = r"\.nfs[0-9a-f]+|\.DS_Store"

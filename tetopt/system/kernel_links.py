@@ -1,6 +1,6 @@
 """The inside of numba that kernels use: records passed by address, units called through the linker's symbols.
 
-What is imported here may be gone in any version of numba. `tetopt.kernels` then does without this module.
+What is imported here may be gone in any version of numba. `tetopt.system.kernels` then does without this module.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from numba.core.typing.templates import AttributeTemplate, infer_getattr, make_i
 from numba.extending import NativeValue, intrinsic
 from numba.np.arrayobj import populate_array
 
-from tetopt.kernel_cache import checksum, njit
-from tetopt.kernel_types import check_array, numpy_dtype, type_of
+from tetopt.system.kernel_cache import checksum, njit
+from tetopt.system.kernel_types import check_array, numpy_dtype, type_of
 
 WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 

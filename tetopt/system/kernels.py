@@ -6,8 +6,9 @@ linker's symbol, as a function of another file is in C; a *record* (a NamedTuple
 block of memory whose address is passed. Helpers are plain numba functions that go into the units that use them;
 *entries* are what Python calls; and a parallel loop is a unit run for each number of a range (`run`).
 
-Symbols and addresses are the inside of numba (`tetopt.kernel_links`). Where that fails its test below, or on request,
-kernels are plain functions of numba's, of the same signatures, that take records by value: slower, the same bits.
+Symbols and addresses are the inside of numba (`tetopt.system.kernel_links`). Where that fails its test below, or on
+request, kernels are plain functions of numba's, of the same signatures, that take records by value: slower, the same
+bits.
 
 docs/develop/kernels.md tells what each of these bought.
 """
@@ -37,12 +38,12 @@ from numba import types
 from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
-from tetopt.budget import address_room
-from tetopt.cache import place_cache
-from tetopt.interpreter import python_command, python_environment
-from tetopt.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
-from tetopt.kernel_types import by_value, cast, type_of
+from tetopt.system.budget import address_room
+from tetopt.system.cache import place_cache
 from tetopt.system.child import started
+from tetopt.system.interpreter import python_command, python_environment
+from tetopt.system.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
+from tetopt.system.kernel_types import by_value, cast, type_of
 from tetopt.system.lock import lock_file
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
@@ -63,7 +64,7 @@ Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
 UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
 # In the cache's folder, of all runs of this package: those of another one compile other files.
-LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parent).encode()):08x}.lock"
+LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parents[1]).encode()):08x}.lock"
 PIECES_PER_THREAD = 8  # of a plain loop: some take longer than others
 POLLED_SECONDS = 0.1  # between looks at processes that compile
 LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
@@ -75,13 +76,13 @@ _links: list[Any] = []  # what `links` returns, once it is known
 
 
 def links() -> Any:
-    """Return `tetopt.kernel_links` if it works, which is tested once; else None: kernels are plain `numba.njit`."""
+    """Return `kernel_links` if it works, which is tested once; else None: kernels are plain `numba.njit`."""
     with _LINKING:
         if not _links:
             _links.append(None)
             if not IS_PLAIN:
                 try:
-                    _links[0] = import_module("tetopt.kernel_links")
+                    _links[0] = import_module("tetopt.system.kernel_links")
                     check_links()
                 except Exception as error:  # of any kind: what is imported may be gone, or do something else
                     _links[0] = None
@@ -366,7 +367,7 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
         # Ctrl-C is for this process, which then ends the others.
         code = (
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-            f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
+            f"from tetopt.system.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
         )
         command, environment = python_command("-c", code), python_environment()
         processes = [stack.enter_context(started(command, environment)) for _ in range(n_processes)]

@@ -30,7 +30,7 @@ try:
 except ImportError:  # by `MISSING` below
     FunctionCache = IndexDataCacheFile = DefaultOptions = object
 
-from tetopt.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
+from tetopt.system.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
 
 INSIDE_OPTIONS = ("_nrt", "forceinline", "no_cfunc_wrapper", "no_cpython_wrapper")
 FILE_METHODS = ("_data_path", "_dump", "_load_data", "_load_index", "_open_for_write", "_save_data", "_save_index")
@@ -50,8 +50,11 @@ NOT_KEPT = "compiled kernels cannot be kept, so that later runs compile them aga
 @cache
 def checksum() -> str:
     """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
-    folder, total = Path(__file__).parent, 0
-    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "contents"))]
+    folder, total = Path(__file__).parents[1], 0
+    patterns = [
+        "system/kernel*.py",
+        *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "contents")),
+    ]
     for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
         total = zlib.crc32(path.read_bytes(), total)
     return f"{total:08x}"

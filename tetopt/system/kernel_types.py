@@ -20,7 +20,7 @@ def type_of(hint: Any, of_record: Callable[[Any], types.Type]) -> types.Type:
         return typing.get_args(hint)[1]
     if typing.get_origin(hint) is tuple:
         return types.BaseTuple.from_types([type_of(part, of_record) for part in typing.get_args(hint)])
-    if typing.get_origin(hint) is list:  # of records, one for each thread; see `tetopt.kernels.own`
+    if typing.get_origin(hint) is list:  # of records, one for each thread; see `tetopt.system.kernels.own`
         return of_record(typing.get_args(hint)[0])
     return SCALAR_TYPES[hint] if hint in SCALAR_TYPES else of_record(hint)
 

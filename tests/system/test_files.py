@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tetopt.errors import InputError
-from tetopt.io.files import (
+from tetopt.system.files import (
     TakenError,
     check_space,
     checked_output,
