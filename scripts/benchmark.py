@@ -239,7 +239,7 @@ def graded(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     variance = float(np.var(image.data, dtype=np.float64)) * image.data.size * image.voxel_volume
     return {
         "nodes": shape.n_nodes, "cells": shape.n_cells, "seconds": seconds, "mean_rho": shape.mean_rho,
-        "E_D_share": tetopt.E_D(image, mesh) / variance, "min_dihedral": shape.min_dihedral,
+        "E_D_fraction": tetopt.E_D(image, mesh) / variance, "min_dihedral": shape.min_dihedral,
         "dihedral_1st_percentile": float(np.percentile(smallest, 1)),
     }  # fmt: skip
 
@@ -260,7 +260,7 @@ def graded_large(path: Path, nodes: int) -> dict[str, Any]:
         "q = tetopt.quality(mesh.points, mesh.cells)\n"
         "share = tetopt.E_D(image, mesh) / (float(np.var(image.data, dtype=np.float64)) * image.volume)\n"
         "print(json.dumps({'nodes': q.n_nodes, 'cells': q.n_cells, 'seconds': seconds, 'mean_rho': q.mean_rho,\n"
-        "    'min_dihedral': q.min_dihedral, 'E_D_share': share,\n"
+        "    'min_dihedral': q.min_dihedral, 'E_D_fraction': share,\n"
         "    'peak_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}))\n"
     )
     done = subprocess.run([sys.executable, "-c", program, str(path), str(nodes)], check=True, capture_output=True)
@@ -279,7 +279,7 @@ def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
         "nodes": len(mesh.points),
         "cells": len(mesh.cells),
         "seconds_per_iteration": per_iteration + connect,
-        "delaunay_share": connect / (per_iteration + connect),
+        "delaunay_fraction": connect / (per_iteration + connect),
     }
 
 
@@ -384,12 +384,12 @@ def _show_graded(rows: Sequence[dict[str, Any]], large: dict[str, Any]) -> None:
     for row in rows:
         print(
             f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s; E_D "
-            f"{row['E_D_share']:.5f} of the image's variance, mean rho {row['mean_rho']:.4f}, angles from "
+            f"{row['E_D_fraction']:.5f} of the image's variance, mean rho {row['mean_rho']:.4f}, angles from "
             f"{row['min_dihedral']:.1f}, 1st percentile {row['dihedral_1st_percentile']:.1f}"
         )
     print(
         f"  mesh_image, 256^3 voxels, {large['nodes']} nodes, {large['cells']} tets: {large['seconds']:.0f} s, peak "
-        f"{large['peak_gb']:.2f} GB; E_D {large['E_D_share']:.6f}, mean rho {large['mean_rho']:.4f}, angles from "
+        f"{large['peak_gb']:.2f} GB; E_D {large['E_D_fraction']:.6f}, mean rho {large['mean_rho']:.4f}, angles from "
         f"{large['min_dihedral']:.1f}"
     )
 
@@ -398,7 +398,7 @@ def _show_paper(rows: Sequence[dict[str, Any]], result: dict[str, Any]) -> None:
     for row in rows:
         print(
             f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
-            f"Delaunay {100 * row['delaunay_share']:.0f} % of it"
+            f"Delaunay {100 * row['delaunay_fraction']:.0f} % of it"
         )
     print(
         f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D {result['E_D_of_initial']:.3f} of initial, "

@@ -75,8 +75,8 @@ def balls(edge: int) -> str:
     """The phantom's file."""
     random, (least, most) = np.random.default_rng(21), BALL_RADII
     # Of radius r there are in proportion to r^-2.5: number times surface, in steps of a factor, is about the same.
-    share = random.random(N_BALLS)
-    radii = np.sort((least**-1.5 + share * (most**-1.5 - least**-1.5)) ** (-1 / 1.5))[::-1]
+    fraction = random.random(N_BALLS)
+    radii = np.sort((least**-1.5 + fraction * (most**-1.5 - least**-1.5)) ** (-1 / 1.5))[::-1]
     text = f"""
 name = "balls"
 description = "{N_BALLS} ellipsoids of all sizes, the large first"
@@ -155,7 +155,7 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
     return {
         "stages": stages, "tasks": tasks, "worker_peaks": sorted(peaks.values()),
         "predicted_task_bytes": predicted, "client_peak": peak_bytes(), "n_nodes": len(result.mesh.points),
-        "n_cells": len(result.mesh.cells), "missed": list(result.missed),
+        "n_cells": len(result.mesh.cells), "violated": list(result.violated),
         "history": [record._asdict() for record in result.history],
     }  # fmt: skip
 

@@ -26,13 +26,13 @@ from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import compare
 from tetopt.geometry.quadratic import gauss_rule, quadratic
 from tetopt.model.averages import element_young, parse_average
-from tetopt.study.compare import Standard, default_law, prepared
+from tetopt.study.compare import Standard, default_mapping, prepared
 from tetopt.study.compare_report import Settings
 from tetopt.system.files import checked_output, save_json
 
 POINTS = "points"
 AVERAGES = ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic", "hill", "gauss", "nodes", POINTS)
-CORNER_SHARE = 1 / 7.2  # of all nodes of quadratic tetrahedra, before a mesh has shown its own
+CORNER_FRACTION = 1 / 7.2  # of all nodes of quadratic tetrahedra, before a mesh has shown its own
 COUNT_TOLERANCE = 0.03  # of the requested number of nodes
 
 
@@ -66,8 +66,10 @@ def _run(options: argparse.Namespace) -> int:
     settings = Settings(nodes=0, reference_dofs=options.dofs)
     rows: list[dict[str, Any]] = []
     for name, image, labels in cases(options.phantoms, options.images):
-        law, _ = default_law(image)
-        standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
+        mapping, _ = default_mapping(image)
+        standard = prepared(
+            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
+        )
         for order in options.orders:
             for mode in options.modes:
                 mesh = _mesh(image, mode, options.nodes, order)
@@ -85,7 +87,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _mesh(image: tetopt.Image, mode: str, nodes: int, order: int) -> tetopt.Mesh:
     """A mesh of about so many nodes of the order."""
-    mesh = tetopt.mesh_image(image, nodes if order == 1 else round(CORNER_SHARE * nodes), mode=mode).mesh
+    mesh = tetopt.mesh_image(image, nodes if order == 1 else round(CORNER_FRACTION * nodes), mode=mode).mesh
     for _ in range(3 if order == 2 else 0):
         count = len(quadratic(mesh.points, mesh.cells)[0])
         if abs(count / nodes - 1.0) <= COUNT_TOLERANCE:

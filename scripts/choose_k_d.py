@@ -19,7 +19,7 @@ import numpy as np
 import tetopt
 from tetopt.fem.reference import averaged
 from tetopt.measure.segmentation import thresholded
-from tetopt.study.compare import default_law, measured, prepared
+from tetopt.study.compare import default_mapping, measured, prepared
 from tetopt.study.compare_report import Settings, Simulation
 from tetopt.system.files import checked_output, save_json
 
@@ -50,8 +50,10 @@ def _run(options: argparse.Namespace) -> int:
     settings = Settings(nodes=0, reference_dofs=options.dofs)
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
-        law, _ = default_law(image)
-        standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
+        mapping, _ = default_mapping(image)
+        standard = prepared(
+            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
+        )
         for nodes in options.nodes:
             initial = tetopt.lattice_mesh(image, nodes=nodes)
             for k_D in options.k_d:
@@ -88,7 +90,7 @@ def error_of(simulation: Simulation, name: str) -> float:
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
     errors = [f"nu {nu}: " + " ".join(f"{error_of(f, e):.4f}" for e in SHOWN_ERRORS) for nu, f in mesh.fem.items()]
-    shape = f"E_D {mesh.E_D_share:.4f} rho {mesh.quality.mean_rho:.3f}"
+    shape = f"E_D {mesh.E_D_fraction:.4f} rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']} {row['nodes']} nodes k_D {row['k_D']:g}: {shape}  " + "  ".join(errors)
 
 

@@ -20,8 +20,8 @@ from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases, error_of
 
 import tetopt
 from tetopt.fem.reference import at_centres
-from tetopt.start.sizes import COARSEST_SHARE
-from tetopt.study.compare import Standard, default_law, measured, prepared
+from tetopt.start.sizes import COARSEST_RATIO
+from tetopt.study.compare import Standard, default_mapping, measured, prepared
 from tetopt.study.compare_report import Settings
 from tetopt.system.files import checked_output, save_json
 
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
     parser.add_argument("--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)")
-    parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_SHARE, 2.0, np.inf])
+    parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_RATIO, 2.0, np.inf])
     parser.add_argument("--nodes", type=int, default=2000)
     parser.add_argument("--dofs", type=int, default=150_000, help="size of the reference grid (%(default)s)")
     parser.add_argument("--force", action="store_true", help="replace an existing output")
@@ -51,8 +51,10 @@ def _run(options: argparse.Namespace) -> int:
     settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),))
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
-        law, _ = default_law(image)
-        standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
+        mapping, _ = default_mapping(image)
+        standard = prepared(
+            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
+        )
         for kind, mesh in _meshes(image, standard, options.nodes, options.largest):
             numbers = measured(standard, mesh, settings.percent)
             rows.append({"image": name, "mesh": kind, "measured": numbers})
@@ -68,7 +70,7 @@ def _meshes(
     lattice = tetopt.lattice_mesh(image, nodes=nodes)
     yield "lattice", lattice
     yield "uniform", tetopt.optimize(image, lattice).mesh
-    edge = tetopt.Sizes().longest_edge(image, nodes) / COARSEST_SHARE
+    edge = tetopt.Sizes().longest_edge(image, nodes) / COARSEST_RATIO
     for factor in largest:
         sizes = tetopt.Sizes(longest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh
@@ -91,7 +93,7 @@ def _strained(standard: Standard) -> tetopt.Image:
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
     errors = " ".join(f"{error_of(mesh.fem[STANDARD_NU], e):.4f}" for e in SHOWN_ERRORS)
-    size = f"{mesh.n_nodes} nodes, E_D {mesh.E_D_share:.4f}, rho {mesh.quality.mean_rho:.3f}"
+    size = f"{mesh.n_nodes} nodes, E_D {mesh.E_D_fraction:.4f}, rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']}, {row['mesh']}: {size}; errors {errors}"
 
 

@@ -112,7 +112,7 @@ def method_figure() -> Figure:
     ]
     for axes, mesh, title in meshes:
         means_panel(
-            axes, image, mesh, f"{title}: {len(mesh.points)} nodes\nE_D {share_of(image, mesh):.3f} of the variance"
+            axes, image, mesh, f"{title}: {len(mesh.points)} nodes\nE_D {fraction_of(image, mesh):.3f} of the variance"
         )
     energy = panels[1, 2]
     for result, colour, name in (
@@ -138,7 +138,7 @@ def octree_figure() -> Figure:
     figure = Figure(figsize=(9.6, 3.7), layout="constrained")
     image_panel, first, last = figure.subplots(1, 3)
     for axes, mesh in ((image_panel, result.initial), (first, result.initial), (last, result.mesh)):
-        title = f"{len(mesh.points)} nodes\nE_D {share_of(image, mesh):.4f} of the variance"
+        title = f"{len(mesh.points)} nodes\nE_D {fraction_of(image, mesh):.4f} of the variance"
         if axes is image_panel:
             axes.imshow(image.data.T, origin="lower", cmap="gray", extent=_extent(image), vmin=0, vmax=255)
             axes.plot(*mesh.points.T, ".", color=MESH_LINE, markersize=3)
@@ -150,19 +150,19 @@ def octree_figure() -> Figure:
 
 
 def move_figure() -> Figure:
-    """One node's ring across an edge of the image: E by the node's place, and the ring before and after the move."""
+    """One node's star across an edge of the image: E by the node's place, and the star before and after the move."""
     image = _half_bright()
     corners = np.array([[1.0, 3.5], [5.5, 1.2], [10.5, 2.0], [12.6, 6.2], [9.8, 11.4], [4.6, 12.4], [1.4, 8.6]])
     first = np.array([6.3, 6.2])
     x, y = np.meshgrid(np.linspace(2.0, 12.0, 81), np.linspace(2.0, 12.0, 81), indexing="ij")
-    before = _ring(corners, first)
+    before = _star(corners, first)
     energies = np.full(x.shape, np.nan)
     for at in np.ndindex(x.shape):
         node = np.array([x[at], y[at]])
         if (_signed_area(corners, np.roll(corners, -1, axis=0), node[None]) > 1.0).all():  # no triangle is turned over
-            energies[at] = _ring_energy(image, _ring(corners, node), before)
+            energies[at] = _star_energy(image, _star(corners, node), before)
     least = np.unravel_index(np.nanargmin(energies), energies.shape)
-    after = _ring(corners, np.array([x[least], y[least]]))
+    after = _star(corners, np.array([x[least], y[least]]))
     figure = Figure(figsize=(9.4, 3.5), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     means_panel(left, image, before, "before: E = 1")
@@ -266,7 +266,8 @@ def k_d_figure() -> Figure:
         mesh = tetopt.mesh_image(image, nodes=113, mode="uniform", k_D=k_D, iterations=20).mesh
         shape = tetopt.quality(mesh.points, mesh.cells)
         title = (
-            f"k_D = {k_D:g}: E_D {share_of(image, mesh):.3f}\nmean rho {shape.mean_rho:.3f}, worst {shape.min_rho:.3f}"
+            f"k_D = {k_D:g}: E_D {fraction_of(image, mesh):.3f}\nmean rho {shape.mean_rho:.3f}, worst "
+            f"{shape.min_rho:.3f}"
         )
         means_panel(axes, image, mesh, title)
     return figure
@@ -287,7 +288,7 @@ def order_figure() -> Figure:
     return figure
 
 
-def share_of(image: tetopt.Image, mesh: tetopt.Mesh) -> float:
+def fraction_of(image: tetopt.Image, mesh: tetopt.Mesh) -> float:
     """E_D over the image's variance times its volume."""
     return float(tetopt.E_D(image, mesh) / (image.data.var() * image.volume))
 
@@ -319,17 +320,17 @@ def _half_bright() -> tetopt.Image:
     return tetopt.Image(np.where(x + 1.15 * y > 15.8, 225.0, 60.0), np.diag([0.1, 0.1, 1.0]))
 
 
-def _ring(corners: NDArray[np.float64], node: NDArray[np.float64]) -> tetopt.Mesh:
+def _star(corners: NDArray[np.float64], node: NDArray[np.float64]) -> tetopt.Mesh:
     """The triangles between a node, the last one, and the corners around it."""
     n = len(corners)
     cells = np.stack([np.arange(n), (np.arange(n) + 1) % n, np.full(n, n)], axis=1)
     return tetopt.Mesh(np.vstack([corners, node]), cells)
 
 
-def _ring_energy(image: tetopt.Image, ring: tetopt.Mesh, first: tetopt.Mesh) -> float:
-    """Eq. (4) of a ring, k_D = 0.5, over what it was before the move."""
-    E_G, E_G0 = (tetopt.E_G(mesh.points, mesh.cells) for mesh in (ring, first))
-    return combined(E_G, tetopt.E_D(image, ring), E_G0, tetopt.E_D(image, first), 0.5)
+def _star_energy(image: tetopt.Image, star: tetopt.Mesh, first: tetopt.Mesh) -> float:
+    """Eq. (4) of a star, k_D = 0.5, over what it was before the move."""
+    E_G, E_G0 = (tetopt.E_G(mesh.points, mesh.cells) for mesh in (star, first))
+    return combined(E_G, tetopt.E_D(image, star), E_G0, tetopt.E_D(image, first), 0.5)
 
 
 def _signed_area(a: NDArray[np.float64], b: NDArray[np.float64], places: NDArray[np.int64]) -> NDArray[np.float64]:

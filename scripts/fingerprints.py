@@ -37,7 +37,7 @@ RUN_WORDS = {
     "uniform_one_thread": "T1 --uniform --nodes 2000 --threads 1",
     "uniform_two_threads": "T1 --uniform --nodes 2000 --threads 2",
     "target_error": "HALF --target-error 0.03",
-    "sizes": "HALF --nodes 4000 --size-min 6 --size-max 30 --gradation 0.3",
+    "sizes": "HALF --nodes 4000 --size-min 6 --edge-size 30 --gradation 0.3",
     "paper": "HALF --method paper --nodes 1000 --iterations 6",
     "paper_accept": "HALF --method paper --nodes 600 --iterations 4 --retessellate accept --k-d 0.5",
     "paper_shape_only": "HALF --method paper --nodes 600 --iterations 4 --k-d 0",

@@ -103,7 +103,7 @@ slab_labels_10k      {data}/ct_abdomen_slab_3mm.nii.gz --labels {data}/ct_abdome
 QUICK_RUNS = "small {crop48} --nodes 200 --iterations 1\n*less {crop48} --nodes 150 --iterations 1"
 PAIRED = ("half_5k", "half_20k", "crop96_paper_2k", "t1_5k", "t1_mask_10k", "t1_labels_10k", "t1_uniform_5k")
 POLL_SECONDS = 0.1  # between looks at a process's threads
-TRUSTED_SHARE = 0.9  # of the runs left out, whose errors are stated as those to expect
+TRUSTED_FRACTION = 0.9  # of the runs left out, whose errors are stated as those to expect
 FIT_TURNS = 20  # until weights and costs belong together: six digits come of ten
 BYTES_IN_BARS = 0.5 * BYTES_PER_GB  # less memory does not decide where a run goes
 
@@ -240,7 +240,7 @@ def run(name: str, threads: int, words: list[str], base: Path) -> Row:
             main_seconds = max(main_seconds, thread_seconds(process.pid))
             time.sleep(POLL_SECONDS)
     process.returncode = code = os.waitstatus_to_exitcode(status)
-    if not numbers.exists():  # the code is 1 if a promise is missed, too, which costs as much
+    if not numbers.exists():  # the code is 1 if a requirement is violated, too, which costs as much
         last = (base / "log").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
         raise tetopt.InputError(f"{name}: ended with code {code}: {' '.join(last)}")
     size = json.loads(numbers.read_text(encoding="utf-8"))["prediction"]["size"]
@@ -260,7 +260,7 @@ def thread_seconds(process: int) -> float:
 
 
 def fitted(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """The model: costs by term, threads' share, and the errors of runs that were left out."""
+    """The model: costs by term, the fraction that threads divide, and the errors of runs that were left out."""
     rows = at_one_pace(rows)
     single = [row for row in rows if row.threads == 1]
     known = [row for row in single if not row.is_left_out]
@@ -276,11 +276,11 @@ def fitted(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     large = [row for row in left_out if row.peak_bytes > BYTES_IN_BARS] or left_out
     space_ratios = [summed(n_bytes, memory_terms(row.size)) / row.peak_bytes for row in large]
     return model | {
-        "threads": {"parallel_share": parallel_share(rows, seconds)},
+        "threads": {"parallel_fraction": parallel_fraction(rows, seconds)},
         "machine": {"calibration_seconds": rows[0].calibration_seconds},
         "errors": {
-            "seconds_factor": float(np.exp(np.quantile(np.abs(np.log(time_ratios)), TRUSTED_SHARE))),
-            "bytes_share": float(np.quantile(np.abs(np.array(space_ratios) - 1.0), TRUSTED_SHARE)),
+            "seconds_factor": float(np.exp(np.quantile(np.abs(np.log(time_ratios)), TRUSTED_FRACTION))),
+            "bytes_fraction": float(np.quantile(np.abs(np.array(space_ratios) - 1.0), TRUSTED_FRACTION)),
         },
     }
 
@@ -316,7 +316,7 @@ def costs(
     return dict(zip(names, (solution / scale).tolist(), strict=True))
 
 
-def parallel_share(rows: Sequence[Row], seconds: dict[str, float]) -> float:
+def parallel_fraction(rows: Sequence[Row], seconds: dict[str, float]) -> float:
     """Of the sweeps' seconds, what threads divide: by what the main thread has less to do with two."""
     alone = {row.name: row for row in rows if row.threads == 1}
     pairs = [(alone[row.name], row) for row in rows if row.threads == 2 and row.name in alone and row.main_seconds]
@@ -340,7 +340,7 @@ def model_text(model: dict[str, dict[str, float]], rows: Sequence[Row]) -> str:
         "# What a run of `tetopt mesh` costs; written by scripts/fit_cost.py, see tetopt.engine.cost for the terms.",
         f"# {datetime.datetime.now(datetime.UTC):%Y-%m-%d}, tetopt {tetopt.__version__}, {processor()}, "
         f"{os.cpu_count()} cores, Python {platform.python_version()}",
-        f"# fitted to {n_known} runs; the errors are those of {TRUSTED_SHARE:.0%} of {n_left_out} others",
+        f"# fitted to {n_known} runs; the errors are those of {TRUSTED_FRACTION:.0%} of {n_left_out} others",
     ]
     for name, values in model.items():
         lines += ["", f"[{name}]", *(f"{key} = {value:.4g}" for key, value in values.items())]

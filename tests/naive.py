@@ -81,7 +81,7 @@ def E_G_as_printed(points, cells):
     n = len(points[0])
     origin = [sum(axis) / len(points) for axis in zip(*points, strict=True)]
     points = [minus(p, origin) for p in points]
-    ring_volume = [Fraction(0)] * len(points)
+    star_volume = [Fraction(0)] * len(points)
     integral = Fraction(0)
     for cell in cells:
         corners = [points[a] for a in cell]
@@ -89,8 +89,8 @@ def E_G_as_printed(points, cells):
         total = [sum(axis) for axis in zip(*corners, strict=True)]
         integral += v * (dot(total, total) + sum(dot(c, c) for c in corners)) / ((n + 1) * (n + 2))
         for a in cell:
-            ring_volume[a] += v
-    return float(sum(dot(p, p) * v for p, v in zip(points, ring_volume, strict=True)) / (n + 1) - integral)
+            star_volume[a] += v
+    return float(sum(dot(p, p) * v for p, v in zip(points, star_volume, strict=True)) / (n + 1) - integral)
 
 
 def volume_and_E_G(corners):
@@ -209,7 +209,7 @@ def too_long(points, cells, target):
     return is_one
 
 
-def rings(cells, n_nodes):
+def stars(cells, n_nodes):
     """The cells of each node, ascending."""
     return [[number for number, cell in enumerate(cells) if node in cell] for node in range(n_nodes)]
 
@@ -262,8 +262,10 @@ def plane_cut(points, cells, height):
         places = []
         for a, b in combinations(cell, 2):
             if (height[a] >= 0) != (height[b] >= 0):
-                share = height[a] / (height[a] - height[b])
-                places.append([float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)])
+                fraction = height[a] / (height[a] - height[b])
+                places.append(
+                    [float((1 - fraction) * p + fraction * q) for p, q in zip(points[a], points[b], strict=True)]
+                )
         if places:
             crossings[number] = places
     return crossings
@@ -297,14 +299,14 @@ def interpolation(fine, coarse):
 
 
 def block_means(data, shape):
-    """Means over the voxels of a coarser grid on the same box, cut voxels by their share; exact shares."""
+    """Means over the voxels of a coarser grid on the same box, cut voxels by their fraction; exact shares."""
     for axis, new in enumerate(shape):
         old = data.shape[axis]
-        shares = np.zeros((new, old))
+        fractions = np.zeros((new, old))
         for row, column in product(range(new), range(old)):
             low, high = max(Fraction(row * old, new), column), min(Fraction((row + 1) * old, new), column + 1)
-            shares[row, column] = max(Fraction(0), high - low) * Fraction(new, old)
-        data = np.moveaxis(np.tensordot(shares, data, axes=(1, axis)), 0, axis)
+            fractions[row, column] = max(Fraction(0), high - low) * Fraction(new, old)
+        data = np.moveaxis(np.tensordot(fractions, data, axes=(1, axis)), 0, axis)
     return data
 
 
@@ -473,11 +475,11 @@ def smooth_level(inside):
     least = np.maximum(size - 1.0, 0.05)
     most = np.where(size <= 0.5, 0.95, size + 1.0)
     reach = np.minimum(largest_around(distance * inside, 6), largest_around(distance * ~inside, 6))
-    share = np.clip((reach - 4.0) / 3.0, 0.0, 1.0)
+    fraction = np.clip((reach - 4.0) / 3.0, 0.0, 1.0)
     level = sign * size
     for _ in range(4):
         fine, broad = ((once := blurred(level, sigma)) + blurred(level - once, sigma) for sigma in (1.0, 3.0))
-        smooth = fine + share * (broad - fine)
+        smooth = fine + fraction * (broad - fine)
         smooth = smooth - volume_missing(smooth, inside)
         level = sign * np.clip(sign * smooth, least, most)
     return np.clip(level, -6.0, 6.0)

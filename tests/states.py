@@ -7,11 +7,11 @@ from meshes import delaunay_box
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.energy.sampling import channel_grid, from_ticks
-from tetopt.engine.complex import build, energies, node_rings, remeasure
+from tetopt.engine.complex import build, energies, node_stars, remeasure
 from tetopt.engine.flips import flip
 from tetopt.engine.repair import repair
 from tetopt.engine.smooth import blocks, sweep
-from tetopt.engine.state import state_of, with_floor
+from tetopt.engine.state import state_of, with_min_dihedral
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -65,8 +65,8 @@ class Engine:
             complex=self.complex._replace(**arrays), objective=self.objective._replace(**parts)
         )
 
-    def keep_floor(self, degrees):
-        self.state = with_floor(self.state, degrees)
+    def keep_min_dihedral(self, degrees):
+        self.state = with_min_dihedral(self.state, degrees)
 
     def fresh(self, cells=None):
         """The state of the mesh, or of other cells, measured from nothing."""
@@ -75,7 +75,7 @@ class Engine:
 
     def sweep(self):
         everyone = np.ones(len(self.complex.ticks), dtype=bool)
-        sweep(self.state, node_rings(self.state), blocks(self.complex.ticks), everyone)
+        sweep(self.state, node_stars(self.state), blocks(self.complex.ticks), everyone)
 
     def flip(self, passes=50):
         self.state, n_flips = flip(self.state, passes=passes)

@@ -37,7 +37,7 @@ def folded(mesh):
     return Mesh(np.vstack([mesh.points, apex]), np.vstack([mesh.cells, added]))
 
 
-def strange(n):
+def unusual(n):
     """Meshes by name; all but "far" and "part" lie over themselves somewhere."""
     mesh = tetopt.lattice_mesh(image_of(n), blocks=(2,) * n)
     half = Mesh(mesh.points, mesh.cells[: len(mesh.cells) // 2])
@@ -53,13 +53,13 @@ def strange(n):
 
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
-CASES = [(n, name) for n in (2, 3) for name in strange(2)]
+CASES = [(n, name) for n in (2, 3) for name in unusual(2)]
 
 
 @pytest.mark.kernel
 @pytest.mark.parametrize(("n", "name"), CASES)
 def test_a_voxel_is_the_first_cell_s_that_holds_it(n, name):
-    image, mesh = image_of(n), strange(n)[name]
+    image, mesh = image_of(n), unusual(n)[name]
     alone = np.array(
         [tetopt.cell_of_voxel(image, Mesh(mesh.points[cell], np.arange(n + 1)[None])) == 0 for cell in mesh.cells]
     )
@@ -154,7 +154,7 @@ def test_no_public_function_is_left_out():
 @pytest.mark.parametrize("function", [*WITH_IMAGE, *MORE])
 def test_an_answer_or_one_refusal(function, n, name):
     """Nan stands for what is not there, such as a distance from no surface; no other number is not finite."""
-    image, mesh = image_of(n), strange(n)[name]
+    image, mesh = image_of(n), unusual(n)[name]
     said, answer = "", None
     try:
         answer = (WITH_IMAGE | MORE)[function](image, mesh)

@@ -36,7 +36,7 @@ def test_faults(mesh):
     inner = np.flatnonzero((np.abs(IMAGE.to_index(points) - 3.5) < 2.0).all(axis=1))[0]
     assert "box" in problems(points * 1.1, cells)
     far = np.vstack([points, points[cells[0]] + 100.0])
-    assert "pieces that share no facet: 2" in problems(far, np.vstack([cells, len(points) + np.arange(4)]))
+    assert "components that share no facet: 2" in problems(far, np.vstack([cells, len(points) + np.arange(4)]))
     # A cell put on top of another one across a facet.
     apex = np.vstack([points, points[cells[0]].mean(axis=0)])
     on_top = np.vstack([cells, [cells[0, 0], cells[0, 1], cells[0, 2], len(points)]])

@@ -28,6 +28,7 @@ from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phanto
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
 from tetopt.engine.loop import MeshingResult
+from tetopt.errors import FORMER_NAMES
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import listened
@@ -126,7 +127,7 @@ def test_mesh_in_3d(run):
     assert numbers["energies"]["E_D_relative"] < 0.5  # the sphere is found
 
 
-SIZES = ("size_min", "size_max", "edge_max", "gradation", "sizing")
+SIZES = ("size_min", "edge_size", "edge_max", "gradation", "sizing")
 OPTIONS_OF_A_RUN = {
     *("nodes", "target_error", "spacing", "lattice", *SIZES, "start"),
     *("volume", "crop", "slice", "method", "max_seconds", "max_gb", "k_D", "iterations", "boundary", "n_t"),
@@ -349,11 +350,14 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 
 def test_what_is_violated_is_told_in_the_commands_options(capsys):
     result = MeshingResult(None, [], "iterations", None)
-    missed = {"floor": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`", "box": "k_D.nii lies beyond"}
+    violated = {
+        "min_dihedral": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`",
+        "box": "k_D.nii lies beyond",
+    }
     with listened(show_event):
         assert tell_violated(result, {}) == []
         assert capsys.readouterr().err == ""
-        assert tell_violated(result._replace(missed=missed), {}) == list(missed.values())
+        assert tell_violated(result._replace(violated=violated), {}) == list(violated.values())
     said = capsys.readouterr().err
     assert said == (
         "tetopt: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\ntetopt: k_D.nii lies beyond\n"
@@ -696,8 +700,8 @@ def test_quality_of_a_run(run, inputs, tmp_path, capsys):
     assert report["quality"] == numbers["quality"]
     assert report["n_turned"] == 0
     assert report["fit"]["E_D"] == pytest.approx(numbers["history"][-1]["E_D"], rel=1e-6)
-    assert report["fit"]["E_D_share_of_variance"] == pytest.approx(
-        numbers["energies"]["E_D_share_of_variance"], rel=1e-6
+    assert report["fit"]["E_D_fraction_of_variance"] == pytest.approx(
+        numbers["energies"]["E_D_fraction_of_variance"], rel=1e-6
     )
     assert report["fit"]["n_voxels"] == image.data.size
     assert report["fit"]["n_empty_cells"] == int((file.cell_data["n_voxels"] == 0).sum())
@@ -960,14 +964,14 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
         (["--nodes", "7"], "9 or more in 3-D, got 7"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
         (["--nodes", "500", "--target-error", "0.1"], "--nodes and --target-error: give one of them"),
-        (["--target-error", "1.5"], "expected a share of the image's variance, 0 to 1, got 1.5"),
-        (["--nodes", "100", "--size-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
+        (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
+        (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--nodes", "100", "--edge-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
-        (["--size-max", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
+        (["--edge-size", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
         (["--edge-max", "0"], "--edge-max: expected a length above 0"),
         (["--size-min", "9", "--edge-max", "8"], "--edge-max: 8 mm is below the smallest size, 9 mm"),
-        (["--size-max", "-1"], "--size-max: expected a length above 0"),
-        (["--size-min", "9", "--size-max", "8"], "--size-max: 8 mm is below the smallest size, 9 mm"),
+        (["--edge-size", "-1"], "--edge-size: expected a length above 0"),
+        (["--size-min", "9", "--edge-size", "8"], "--edge-size: 8 mm is below the smallest size, 9 mm"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
         (["--sizing", "missing.nii"], "missing.nii"),
     ],
@@ -993,15 +997,15 @@ def test_octree_mesh(tmp_path, inputs, capsys):
     assert len(loaded.mesh.points) == 400
     assert exit_code(*words, "--force", "--k-d", "0", "--iterations", "1") == 0
     err = capsys.readouterr().err
-    missed = len(tetopt.load_mesh(path).mesh.points)
-    assert (f"{missed} nodes instead of 400" in err) == (abs(missed - 400) > 4)
+    violated = len(tetopt.load_mesh(path).mesh.points)
+    assert (f"{violated} nodes instead of 400" in err) == (abs(violated - 400) > 4)
 
 
 @pytest.mark.parametrize("word", ["--uniform", "--spacing 8", "--lattice five-tet", "--method paper"])
-@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--size-max 9", "--edge-max 9"])
+@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--edge-size 9", "--edge-max 9"])
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
     if word == "--spacing 8" and option.startswith("--target"):
-        option = "--size-max 9"
+        option = "--edge-size 9"
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
     assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
 
@@ -1012,16 +1016,16 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     field = np.where(np.arange(16)[:, None, None] < 5, 13.0, 0.0) * np.ones((1, 16, 16))
     save_image(tmp_path / "sizes.nii.gz", Image(field, image.affine))
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    words = ["--nodes", "500", "--size-max", "30", "--sizing", tmp_path / "sizes.nii.gz", "--gradation", "0.9"]
+    words = ["--nodes", "500", "--edge-size", "30", "--sizing", tmp_path / "sizes.nii.gz", "--gradation", "0.9"]
     assert exit_code(*command, *words) == 0
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert len(mesh.points) == 500
     numbers = numbers_in(tmp_path / "a.json")
     options, met = numbers["options"], numbers["edges_over_target"]
     assert [options[name] for name in SIZES] == [None, 30.0, None, 0.9, "sizes.nii.gz"]
-    sizes = tetopt.Sizes(largest=30.0, field=Image(field, image.affine), gradation=0.9)
+    sizes = tetopt.Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
-    assert len(met["edges_of_bins"]) == len(met["share"]) + 1
+    assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
     line = f"edges over their target size: {met['mean']:.2f} in the mean; {met['below']:.1%} under 0.71"
     assert line in capfd.readouterr().out
     assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
@@ -1032,18 +1036,18 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
 
 
 def test_sizes_make_the_number_of_nodes(tmp_path, inputs):
-    """Alone they say it; where only a part has a target, the rest gets its share of the usual number."""
+    """Alone they say it; where only a part has a target, the rest gets its fraction of the usual number."""
     image = load_image(inputs / "sphere.nii.gz")
     command = [*mesh_words(inputs / "sphere.nii.gz", tmp_path), "--iterations", "6", "--force"]
-    assert exit_code(*command, "--size-max", "14") == 0
-    needed = nodes_of_sizes(image, tetopt.Sizes(largest=14.0))[0]
+    assert exit_code(*command, "--edge-size", "14") == 0
+    needed = nodes_of_sizes(image, tetopt.Sizes(edge_size=14.0))[0]
     assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == needed
     assert len(load_mesh(tmp_path / "a.vtu").mesh.points) == needed
     field = Image(np.where(np.arange(16)[:, None, None] < 4, 14.0, 0.0) * np.ones((1, 16, 16)), image.affine)
     save_image(tmp_path / "sizes.nii.gz", field)
     assert exit_code(*command, "--sizing", tmp_path / "sizes.nii.gz") == 0
-    of_part, share = nodes_of_sizes(image, tetopt.Sizes(field=field))
-    assert share == 0.25
+    of_part, fraction = nodes_of_sizes(image, tetopt.Sizes(field=field))
+    assert fraction == 0.25
     assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == round(of_part + 0.75 * 16**3 / 8)
 
 
@@ -1054,8 +1058,8 @@ def test_target_error(tmp_path, inputs, capfd):
     numbers = numbers_in(tmp_path / "a.json")
     runs = re.findall(r"run (\d) of up to 6: (\d+) nodes leave ([\d.]+) of the variance", capfd.readouterr().err)
     assert [int(number) for number, _, _ in runs] == list(range(1, len(runs) + 1))
-    assert float(runs[-1][2]) == pytest.approx(numbers["energies"]["E_D_share_of_variance"], rel=1e-3)
-    assert numbers["energies"]["E_D_share_of_variance"] <= 0.2
+    assert float(runs[-1][2]) == pytest.approx(numbers["energies"]["E_D_fraction_of_variance"], rel=1e-3)
+    assert numbers["energies"]["E_D_fraction_of_variance"] <= 0.2
     nodes = numbers["options"]["nodes"]
     assert numbers["options"]["target_error"] == 0.2
     assert exit_code(*command, "--force", "--nodes", nodes) == 0
@@ -1150,3 +1154,11 @@ def test_an_error_of_a_million_letters_is_cut(capsys):
     assert error.startswith("tetopt: a.txt, line 3: expected a label, got x")
     assert error.endswith("x; mend it\n")
     assert len(error) < 500
+
+
+@pytest.mark.parametrize(("former", "now"), FORMER_NAMES.items())
+def test_a_former_name_is_refused_with_that_of_now(former, now, capsys):
+    words = ["mesh", "a.nii", "-o", "a.vtu", "--" + former.replace("_", "-"), "9"]
+    assert (exit_code(*words), f"(Possible options: --{now.replace('_', '-')})" in capsys.readouterr().err) == (2, True)
+    with pytest.raises(tetopt.InputError, match=f"has no option '{former}'; is {now} meant"):
+        tetopt.Job.from_json(json.dumps({former: 9}))

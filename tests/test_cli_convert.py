@@ -21,7 +21,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.model.averages import cell_young
 from tetopt.model.loads import parse_load
 
-LAW = "1 + h/7"
+MAPPING = "1 + h/7"
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     out = tmp_path / f"out{suffix}"
-    more = [] if FORMATS[suffix].is_surface else ["--young", LAW, "--bins", "3", "--set", "dark=below:20"]
+    more = [] if FORMATS[suffix].is_surface else ["--young", MAPPING, "--bins", "3", "--set", "dark=below:20"]
     assert exit_code("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
     assert out.stat().st_size > 900
     said = capsys.readouterr().out
@@ -78,7 +78,9 @@ def test_mesh_writes_every_format(folder, tmp_path, suffix):
 def quadratic_path(folder):
     """The same mesh of order 2, with a displacement of every node."""
     path = folder / "quadratic.vtu"
-    assert exit_code("convert", folder / "a.vtu", path, "--order", "2", "--young", LAW, "--load", "compress:5%") == 0
+    assert (
+        exit_code("convert", folder / "a.vtu", path, "--order", "2", "--young", MAPPING, "--load", "compress:5%") == 0
+    )
     grid = pyvista.read(path)
     grid.point_data["displacement"] = np.asarray(grid.points) ** 2
     grid.save(path)
@@ -157,7 +159,7 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
 
 
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
-    options = ["--young", LAW, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
+    options = ["--young", MAPPING, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
     options += ["--json", tmp_path / "b.json"]
     assert exit_code("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
     first, loaded = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
@@ -195,8 +197,8 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     assert again.box.shape == first.box.shape
 
 
-def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
-    """Of a curved law, which is not the law of the mean; the geometric one unless another is asked for."""
+def test_an_image_gives_the_mean_of_the_mapping(folder, tmp_path):
+    """Of a curved mapping, which is not the mapping of the mean; the geometric one unless another is asked for."""
     image = ["--image", folder / "a.nii.gz"]
     for name, more in (("mean", []), ("image", [*image, "--average", "mean"]), ("default", image)):
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
@@ -213,7 +215,7 @@ def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
 
 def test_a_file_has_one_modulus_a_cell_of_those_at_gauss_points(folder, tmp_path, capsys):
     for average in ("geometric", "gauss"):
-        options = ["--young", LAW, "--average", average, "--image", folder / "a.nii.gz", "--order", "2"]
+        options = ["--young", MAPPING, "--average", average, "--image", folder / "a.nii.gz", "--order", "2"]
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{average}.vtu", *options) == 0
         assert ("one modulus a cell, its geometric mean" in capsys.readouterr().out) == (average == "gauss")
         assert exit_code("convert", tmp_path / f"{average}.vtu", tmp_path / f"{average}.inp") == 0
@@ -243,7 +245,7 @@ def test_results_of_other_moduli_or_loads_are_left_out(folder, tmp_path, capsys)
 
 
 def test_the_error_of_bins_goes_on(folder, tmp_path, capsys):
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--young", LAW, "--bins", "3") == 0
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--young", MAPPING, "--bins", "3") == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("bins: modulus off by"))
     for source, out in (("a.vtu", "b.vtu"), ("b.vtu", "b.inp")):
         assert exit_code("convert", tmp_path / source, tmp_path / out, "--json", tmp_path / f"{out}.json") == 0
@@ -281,7 +283,7 @@ def test_numbers_that_are_not_a_label_s_are_said(folder, tmp_path, capsys):
         said = capsys.readouterr().out
         assert f"label 0 is {word} {labels.max() + 1}" in said
         assert "2001" not in said
-        assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", "--young", LAW) == 0
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", "--young", MAPPING) == 0
         assert "number from 2001 on (label_1, label_0)" in " ".join(capsys.readouterr().out.split())
 
 
@@ -328,12 +330,12 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     said = capsys.readouterr()
     assert "fills the box" in said.out
     assert f"{len(skin)} cells of lower dimension are left out" in said.err
-    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
+    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", MAPPING) == 2
     assert "the mesh has no means; give the image (--image)" in capsys.readouterr().err
     assert not (tmp_path / "g.inp").exists()
     assert exit_code("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0  # which needs none
     assert "1 material, Young's modulus 3 to 3 kPa" in capsys.readouterr().out
-    options = ["--image", folder / "a.nii.gz", "--young", LAW, "--load", "compress:1%"]
+    options = ["--image", folder / "a.nii.gz", "--young", MAPPING, "--load", "compress:1%"]
     assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
     text = (tmp_path / "g.inp").read_text()
     assert "*STATIC" in text
@@ -371,7 +373,7 @@ def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
         (["--mask", "l.nii.gz"], "--start and --mask"),
         (["--uniform"], "--start and --uniform"),
         (["--lattice", "bcc"], "--start and --lattice"),
-        (["--size-max", "3"], "--size-max: only on a graded mesh"),
+        (["--edge-size", "3"], "--edge-size: only on a graded mesh"),
         (["--method", "paper"], "only with --method fast"),
     ],
 )
@@ -438,9 +440,9 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path):
         *("2/traction:inferior:0.5,-2,0.125", "2/move:inferior:free,1,free"),
     ]
     loads = [part for word in words for part in ("--load", word)]
-    law = ["--young", LAW, "--density", "1000 + h", "--average", "nodes", "--image", folder / "a.nii.gz"]
+    mapping = ["--young", MAPPING, "--density", "1000 + h", "--average", "nodes", "--image", folder / "a.nii.gz"]
     first, second = tmp_path / "a.vtu", tmp_path / "b.vtu"
-    assert exit_code("convert", folder / "a.vtu", first, *law, *loads) == 0
+    assert exit_code("convert", folder / "a.vtu", first, *mapping, *loads) == 0
     assert exit_code("convert", first, second, "--units", "MPa", "--space", "lps") == 0
     texts = [json.loads(tetopt.load_mesh(path).text("loads")) for path in (first, second)]
     assert texts[1][1:4] == ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"]
@@ -466,11 +468,11 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path):
 
 
 def test_large_deformation_and_means_over_cells_are_said(folder, tmp_path, capsys):
-    law = ["--young", LAW, "--average", "nodes", "--image", folder / "a.nii.gz", "--load", "compress:5%"]
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.inp", *law, "--nonlinear") == 0
+    mapping = ["--young", MAPPING, "--average", "nodes", "--image", folder / "a.nii.gz", "--load", "compress:5%"]
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.inp", *mapping, "--nonlinear") == 0
     assert "*STEP, NLGEOM" in (tmp_path / "a.inp").read_text()
     assert "linear within cells" in capsys.readouterr().out
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.feb", *law) == 0
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.feb", *mapping) == 0
     assert "one modulus a cell: the mean" in capsys.readouterr().out
 
 
@@ -558,7 +560,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--young", "2", "--load", "compress:5"], "expected compress:P%"),
         ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),
         ("a.inp", ["--set", "x=above:3"], "expected NAME=below:T"),
-        ("a.feb", [], "needs a material; give a law of the modulus (--young)"),
+        ("a.feb", [], "needs a material; give a modulus mapping (--young)"),
         ("a.stl", ["--young", "2"], "holds the boundary alone"),
         ("a.inp", ["--mask", "m.nii.gz"], "--mask: there is no --image"),
         ("no/a.inp", [], "folder does not exist"),
@@ -770,7 +772,7 @@ def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
         (["--nodes=6"], "tetopt: --nodes: expected a whole number of nodes"),
         (["--load", "hold:nowhere", "--young", "2"], 'tetopt: --load: there is no set of facets "nowhere"'),
         (["--gradation", "3"], "tetopt: --gradation: expected 0.05"),
-        (["--size-max", "-1"], "tetopt: --size-max: expected a length above 0 mm"),
+        (["--edge-size", "-1"], "tetopt: --edge-size: expected a length above 0 mm"),
     ],
 )
 def test_refusals_name_the_option_that_was_given(folder, tmp_path, options, said, capsys):

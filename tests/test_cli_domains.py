@@ -82,8 +82,8 @@ def test_the_numbers(run):
     assert set(rows) == {2, 4, 9}
     assert rows[2]["dice"] > 0.95
     assert [row["weight"] for row in numbers["contrasts"]] == [1.0, 0.5]
-    assert 0.0 < numbers["contrasts"][1]["E_D_share_of_variance"] < 0.5
-    assert 0.0 < numbers["energies"]["E_D_share_of_variance"] < 0.5
+    assert 0.0 < numbers["contrasts"][1]["E_D_fraction_of_variance"] < 0.5
+    assert 0.0 < numbers["energies"]["E_D_fraction_of_variance"] < 0.5
 
 
 def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
@@ -154,14 +154,16 @@ def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, mor
     assert exit_code("quality", mesh, "--image", image, *more, "--check", "--json", again) == code == 1
     judged = capsys.readouterr()
     first, second = numbers_in(numbers), numbers_in(again)
-    share = second["fit"]["E_D_share_of_variance"]
-    assert share == pytest.approx(first["energies"]["E_D_share_of_variance"], rel=1e-9)
-    assert set(second["missed"]) == set(first["missed"]) >= {"error"}
+    fraction = second["fit"]["E_D_fraction_of_variance"]
+    assert fraction == pytest.approx(first["energies"]["E_D_fraction_of_variance"], rel=1e-9)
+    assert set(second["violated"]) == set(first["violated"]) >= {"error"}
     assert [line for line in said.err.splitlines() if "variance is left" in line] == judged.err.splitlines()[-1:]
-    name = re.search("E_D, share of .* variance(?= )", said.out)[0]
+    name = re.search("E_D, fraction of .* variance(?= )", said.out)[0]
     assert f"{name} " in judged.out
-    assert f"{share:.5f}" in judged.out
-    assert re.findall("share of its own variance.*", said.out) == re.findall("share of its own variance.*", judged.out)
+    assert f"{fraction:.5f}" in judged.out
+    assert re.findall("fraction of its own variance.*", said.out) == re.findall(
+        "fraction of its own variance.*", judged.out
+    )
 
 
 @pytest.mark.parametrize("background", ["auto", "60"])
@@ -175,7 +177,7 @@ def test_background(inputs, tmp_path, background, capsys):
     assert 0.0 < numbers["inputs"]["background"] < 400.0
     assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
     captured = capsys.readouterr()
-    assert "E_D, share of the image's variance" in captured.out
+    assert "E_D, fraction of the image's variance" in captured.out
     assert "boundary to the foreground's surface" in captured.out
     assert "mask" not in captured.out + captured.err
 
@@ -188,7 +190,7 @@ def test_labels_alone(inputs, tmp_path, capsys):
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     captured = capsys.readouterr()
     assert "only these count" in captured.err
-    assert "E_D, share of the labels' variance" in captured.out
+    assert "E_D, fraction of the labels' variance" in captured.out
     assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
     first = re.search(r'"fields": \[\{"name": "(\w+)"', (tmp_path / "a.html").read_text())[1]
     assert first == "label"  # not the means of their numbers
@@ -219,7 +221,7 @@ def test_pieces_that_the_cells_do_not_tell_apart(tmp_path, capsys):
     code = exit_code(*command, "-o", tmp_path / "a.vtu")
     said = " ".join(capsys.readouterr().err.split())
     assert ("overlap only by Dice" in said) == (code == 1)
-    assert code == 1 or "the mask has 2 pieces, the mesh 1" in said
+    assert code == 1 or "the mask has 2 components, the mesh 1" in said
 
 
 def test_a_slice_of_all(inputs, tmp_path):

@@ -336,7 +336,7 @@ def measured_run(tmp_path_factory):
     image = sample_image(3)
     for name, values in (("a", image.data), ("l", image.data > 30), ("m", np.ones(image.shape))):
         tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
-    words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--size-max", "9"]
+    words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--edge-size", "9"]
     words += ["--nodes", "60", "--iterations", "3"]
     real, once = tetopt.job.meshing.mesh_image, []
 

@@ -95,7 +95,7 @@ def test_options_instead_of_what_the_file_holds(path, tmp_path, capsys):
 
 
 def test_an_image_with_loads_of_the_user_s(path, tmp_path, capsys):
-    """Its intensities are what the law is of; the conditioning is for the paper's test, or on demand."""
+    """Its intensities are what the mapping is of; the conditioning is for the paper's test, or on demand."""
     image, model = sample_image(), sample_model()
     tetopt.save_image(tmp_path / "image.nii", image)
     numbers = str(tmp_path / "numbers.json")
@@ -251,7 +251,7 @@ def test_moduli_at_gauss_points_go_through_the_file(units, tmp_path, capsys):
     names = [str(tmp_path / name) for name in ("solved.vtu", "again.vtu", "1.json", "2.json", "3.json")]
     words = [str(tmp_path / "a.nii.gz"), str(tmp_path / "mesh.vtu"), "--young", "1+0.02*h", "--order", "2"]
     out, _ = run(capsys, *words, "-o", names[0], "--json", names[2])
-    assert "law of the modulus" in out
+    assert "modulus mapping" in out
     assert "1+0.02*h" in out
     assert "one around each Gauss point" in out
     assert main(["convert", names[0], names[1], *units]) == 0

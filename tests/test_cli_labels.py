@@ -90,7 +90,7 @@ def test_a_label_without_cells_is_named(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("mesh", ["named.vtu", "plain.vtu"])
-def test_laws_and_loads_by_name(folder, tmp_path, mesh, capsys):
+def test_mappings_and_loads_by_name(folder, tmp_path, mesh, capsys):
     more = [] if mesh == "named.vtu" else ["--label-names", folder / "t.csv"]
     young = ["--young", "bright/ball [é]=5,spleen=3,*=20", "--nu", "Bright_Ball_E=0.3,*=0.4"]
     load = ["--load", f"hold:{INTERFACE}", "--load", "pressure:inferior:1"]

@@ -35,7 +35,7 @@ REFUSED = [
     ("--parts 2 --background auto", "--background: looks at all"),
     ("--parts 2 --slice 2=9", "--slice: looks at all"),
     ("--parts 2 --target-error 0.1", "--target-error: looks at all"),
-    ("--parts 2 --size-max 9", "--size-max: looks at all"),
+    ("--parts 2 --edge-size 9", "--edge-size: looks at all"),
     ("--parts 2 --order 2", "--order: looks at all"),
     ("--parts 2 --boundary fixed", "--boundary: looks at all"),
     ("--parts 2 --max-gb 3", "--max-gb: looks at all"),

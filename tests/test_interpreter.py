@@ -34,9 +34,9 @@ endian: little
 
 
 @pytest.fixture(scope="module")
-def strange(tmp_path_factory):
+def untrusted(tmp_path_factory):
     """A folder with images, and a module of each name that Python or what is installed here has."""
-    folder = tmp_path_factory.mktemp("strange")
+    folder = tmp_path_factory.mktemp("untrusted")
     save_image(folder / "a.nii", sample_image(3))
     (folder / "a.nrrd").write_bytes(NRRD.encode() + np.arange(504, dtype="<f4").tobytes())
     (folder / "subjects.tsv").write_text("subject\timage\n1\ta.nii\n")
@@ -46,7 +46,7 @@ def strange(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_modules_of_the_current_folder_are_not_run(strange, tmp_path, name):
+def test_modules_of_the_current_folder_are_not_run(untrusted, tmp_path, name):
     """A user's own program imports what lies beside it all the same."""
     (tmp_path / "program.py").write_text("import sys, beside")
     (tmp_path / "beside.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")
@@ -55,7 +55,7 @@ def test_modules_of_the_current_folder_are_not_run(strange, tmp_path, name):
         word.format(out=tmp_path, program=f"{sys.executable} {tmp_path / 'program.py'} {{image}} {{output}}")
         for word in COMMANDS[name].split()
     ]
-    done = subprocess.run([command, *words], cwd=strange, env=others_environment(), capture_output=True, text=True)
-    executed = strange / "executed"
+    done = subprocess.run([command, *words], cwd=untrusted, env=others_environment(), capture_output=True, text=True)
+    executed = untrusted / "executed"
     assert not executed.exists(), executed.read_text()
     assert (tmp_path / "imported").exists() if name == "a pipeline" else done.returncode in (0, 1), done.stderr

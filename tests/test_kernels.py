@@ -425,7 +425,7 @@ def link(path):
     path.symlink_to(path.with_name("elsewhere"))
 
 
-STRANGERS = {
+UNTRUSTED = {
     "can be written by others than its owner": lambda path: path.chmod(path.stat().st_mode | 0o020),
     "is a link": link,
     "belongs to user 12345": lambda path: os.chown(path, 12345, -1),
@@ -442,10 +442,10 @@ def test_what_others_can_have_written_is_not_loaded(use):
     assert {path.stat().st_mode & 0o022 for path in [folder, *folder.iterdir()]} == {0}
     executed = use.folder / "executed"
     trap = b"cbuiltins\nopen\n(V" + str(executed).encode() + b"\nVw\ntR."
-    kinds = [words for words in STRANGERS if os.geteuid() == 0 or "belongs" not in words]
+    kinds = [words for words in UNTRUSTED if os.geteuid() == 0 or "belongs" not in words]
     for words, path in zip(kinds, indices, strict=False):
         path.write_bytes(path.read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
-        STRANGERS[words](path)
+        UNTRUSTED[words](path)
     *said, _ = use()
     assert all(any(words in line and f"kernels in {folder} are not" in line for line in said) for words in kinds)
     assert not executed.exists()

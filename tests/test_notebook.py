@@ -91,17 +91,17 @@ def test_an_image_is_one_line_and_a_card():
     assert (width, height) == (round(320 / 3), 320)  # 2 mm wide, 6 mm high
 
 
-def test_a_result_tells_what_is_left_and_what_it_misses(ball):
+def test_a_result_tells_what_is_left_and_what_it_violates(ball):
     image, result = ball
-    share = tetopt.E_D(image, result.mesh) / (image.data.var(dtype=np.float64) * image.volume)
-    assert result.share == pytest.approx(share, rel=1e-9)
+    fraction = tetopt.E_D(image, result.mesh) / (image.data.var(dtype=np.float64) * image.volume)
+    assert result.fraction == pytest.approx(fraction, rel=1e-9)
     card = result._repr_html_()
-    assert f"{result.share:.4g} of the variance" in card
+    assert f"{result.fraction:.4g} of the variance" in card
     assert f"{result.history[-1].E:.4g} of the initial" in card
-    assert "misses" not in card
-    assert "<b>" not in result._replace(missed={"floor": "<b>3</b> cells"})._repr_html_()
-    assert "floor: &lt;b&gt;3" in result._replace(missed={"floor": "<b>3</b> cells"})._repr_html_()
-    assert "left within" not in result._replace(share=None)._repr_html_()  # of `optimize`
+    assert "violates" not in card
+    assert "<b>" not in result._replace(violated={"min_dihedral": "<b>3</b> cells"})._repr_html_()
+    assert "min_dihedral: &lt;b&gt;3" in result._replace(violated={"min_dihedral": "<b>3</b> cells"})._repr_html_()
+    assert "left within" not in result._replace(fraction=None)._repr_html_()  # of `optimize`
 
 
 def test_models_files_and_qualities_show_what_they_hold(tmp_path):

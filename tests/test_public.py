@@ -155,8 +155,8 @@ def test_what_is_no_image_is_told_how_to_become_one(what):
 
 
 def test_records_are_looked_into():
-    with pytest.raises(tetopt.InputError, match=r"mesh_image: sizes\.largest: expected a number or None, got '5'"):
-        tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(largest="5"))
+    with pytest.raises(tetopt.InputError, match=r"mesh_image: sizes\.edge_size: expected a number or None, got '5'"):
+        tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(edge_size="5"))
     with pytest.raises(tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"):
         tetopt.octree_mesh(IMAGE, 100, tetopt.Sizes(field="a.nii"))
 

@@ -27,11 +27,11 @@ def test_program(tmp_path, monkeypatch, capsys):
     names: dict = {}
     exec(compile(program, "README.md", "exec"), names)
     first, second, third = capsys.readouterr().out.splitlines()
-    assert first == "all promises are kept"
-    share, shape = re.fullmatch(
+    assert first == "all requirements are met"
+    fraction, shape = re.fullmatch(
         r"(\S+) of the image's variance is left inside the cells; their mean rho is (\S+)", second
     ).groups()
-    assert 0.0001 < float(share) < 0.01
+    assert 0.0001 < float(fraction) < 0.01
     assert float(shape) > 0.24
     n_materials, error = re.fullmatch(r"(\d+) materials, their moduli off by (\S+)% in the mean", third).groups()
     assert 8 <= int(n_materials) <= 16

@@ -93,7 +93,7 @@ def test_the_tables_have_every_key(numbers):
         assert f"| `{key}`" in lines
     for key in ("errors.worst", "kinds.sliver", "[].E_G", "size.n_read", "KEY.colour"):
         assert f"| `{key}`" in lines
-    assert "| `E_D_share_of_variance` |" in lines
+    assert "| `E_D_fraction_of_variance` |" in lines
     assert "| `label_weight` | " in lines
     assert "*number, mm^(n+2).*" in lines
 

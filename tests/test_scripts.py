@@ -69,7 +69,7 @@ def test_benchmark(tmp_path, capsys):
     assert f"E_D {rows['bar']['E_D_of_initial']:.3f} of initial" in printed
     assert rows["sampling_over_find_simplex"] > 0.0
     assert [row["nodes"] for row in rows["paper"]] == sorted(row["nodes"] for row in rows["paper"])
-    assert all(0.0 < row["delaunay_share"] < 1.0 for row in rows["paper"])
+    assert all(0.0 < row["delaunay_fraction"] < 1.0 for row in rows["paper"])
 
 
 def test_fingerprints(tmp_path, capsys):
@@ -96,7 +96,7 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     rows = {row["mesh"]: row["measured"] for row in json.loads(out.read_text())["rows"]}
     assert len(rows) == 2 + 2 + 5
     tight, free = rows["graded, largest 1"], rows["graded, largest inf"]
-    assert free["E_D_share"] < tight["E_D_share"] < rows["uniform"]["E_D_share"]
+    assert free["E_D_fraction"] < tight["E_D_fraction"] < rows["uniform"]["E_D_fraction"]
     displacement = {name: row["fem"]["0.3"]["averages"]["mean"]["errors"]["displacement"] for name, row in rows.items()}
     assert displacement["graded, largest 1"] < displacement["graded, largest inf"]
     assert script("choose_sizes").main(words) == 2
@@ -154,7 +154,7 @@ def measured_rows(module):
 
 
 def test_costs_are_fitted(tmp_path, capsys):
-    """Costs that rows were made of come back from the file that the script writes, as does the threads' share."""
+    """Costs that rows were made of come back from the file that the script writes, as does the threads' fraction."""
     module = script("fit_cost")
     rows, seconds, n_bytes = measured_rows(module)
     model = module.fitted(rows)
@@ -164,10 +164,10 @@ def test_costs_are_fitted(tmp_path, capsys):
         assert back.seconds[name] == pytest.approx(value, rel=0.05, abs=1e-9)
     for name, value in n_bytes.items():
         assert back.bytes[name] == pytest.approx(value, rel=0.05)
-    assert back.parallel_share == pytest.approx(0.8, rel=0.01)
+    assert back.parallel_fraction == pytest.approx(0.8, rel=0.01)
     assert back.calibration_seconds == pytest.approx(0.02)
     assert back.seconds_factor == pytest.approx(1.0, abs=0.01)
-    assert back.bytes_share == pytest.approx(0.0, abs=0.01)
+    assert back.bytes_fraction == pytest.approx(0.0, abs=0.01)
     assert module.table(model, rows).count("| 1.00 |") > 50
 
 

@@ -35,9 +35,9 @@ def test_kernels_are_compiled_beneath_a_launcher(tmp_path, monkeypatch):
     monkeypatch.setattr(kernels, "import_module", lambda _: Kernel)
     monkeypatch.setattr(kernels, "ALL_KERNELS", [])
     monkeypatch.setattr(Kernel, "kernel", Kernel(), raising=False)
-    stranger = os.getppid() + 1
-    kernels.compile_named(["module:kernel"], str(tmp_path), stranger)
+    foreign = os.getppid() + 1
+    kernels.compile_named(["module:kernel"], str(tmp_path), foreign)
     assert compiled == []
     monkeypatch.setattr(sys, "platform", "win32")
-    kernels.compile_named(["module:kernel"], str(tmp_path), stranger)
+    kernels.compile_named(["module:kernel"], str(tmp_path), foreign)
     assert compiled == [Kernel.kernel]

@@ -202,9 +202,9 @@ def asleep(_job):
 
 
 def _leaves_nothing():
-    strangers = [name for name in os.listdir(".") if name.startswith(".")]
-    if strangers:
-        print(f"left behind: {strangers}", file=sys.stderr)
+    foreign_files = [name for name in os.listdir(".") if name.startswith(".")]
+    if foreign_files:
+        print(f"left behind: {foreign_files}", file=sys.stderr)
         return 1
     return 0
 

@@ -54,7 +54,7 @@ from .model.build import build_model as build_model
 from .model.fields import cell_fields as cell_fields
 from .model.file import MeshFile as MeshFile
 from .model.labels import LabelTable as LabelTable
-from .model.laws import ByLabel as ByLabel
+from .model.mappings import ByLabel as ByLabel
 from .model.loads import Load as Load
 from .model.materials import BinningError as BinningError, Materials as Materials
 from .model.model import Model as Model

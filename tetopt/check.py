@@ -140,7 +140,7 @@ def _problems_of_facets(mesh: Mesh) -> list[str]:
 
 def _problems_of_pieces(mesh: Mesh) -> list[str]:
     sizes = np.sort(np.bincount(components(mesh.cells)))[::-1]
-    return [f"pieces that share no facet: {len(sizes)}, of {sizes[:5].tolist()} cells"] if len(sizes) > 1 else []
+    return [f"components that share no facet: {len(sizes)}, of {sizes[:5].tolist()} cells"] if len(sizes) > 1 else []
 
 
 def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]:
@@ -211,7 +211,7 @@ def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[
     return outer, np.any(is_on, axis=(1, 2))
 
 
-def filled_share(mesh: Mesh, image: Image) -> float:
+def filled_fraction(mesh: Mesh, image: Image) -> float:
     """The volume of the cells over that of the image's box; 1 where they fill it without overlaps."""
     return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
@@ -233,7 +233,7 @@ def _problems_with_box(mesh: Mesh, image: Image, is_filled: bool) -> list[str]:
     outer, is_on_box = facets_on_box(mesh, image)
     if not is_on_box.all():
         problems.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~is_on_box])}")
-    filled = filled_share(mesh, image)
+    filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-9:
         problems.append(f"volume: {filled:.12g} of the image's box")
     return problems

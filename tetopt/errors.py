@@ -4,6 +4,9 @@ import inspect
 import os
 import warnings
 
+# What options were called before 0.1.0, where the nearest name now is another one's.
+FORMER_NAMES = {"size_max": "edge_size"}
+
 
 class InputError(ValueError):
     """An input that the user can mend: a file, an array or an option.

@@ -122,9 +122,9 @@ def greys(values: NDArray) -> NDArray[np.int64]:
     """Numbers as greys between the darkest and the brightest; NaN is the darkest."""
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, GREY_QUANTILES) if finite.size else (0.0, 0.0)
-    share = np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.full(values.shape, 0.5)
-    share = np.where(np.isfinite(share), share, 0.0)
-    return np.rint(DARKEST_GREY + share * (BRIGHTEST_GREY - DARKEST_GREY)).astype(np.int64)
+    fraction = np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.full(values.shape, 0.5)
+    fraction = np.where(np.isfinite(fraction), fraction, 0.0)
+    return np.rint(DARKEST_GREY + fraction * (BRIGHTEST_GREY - DARKEST_GREY)).astype(np.int64)
 
 
 def slice_html(data: NDArray, affine: NDArray[np.float64]) -> str:

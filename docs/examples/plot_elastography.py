@@ -24,8 +24,9 @@ noise = 1.0 + 0.02 * np.random.default_rng(0).standard_normal(truth.shape)
 strain = tetopt.Image(axial[tetopt.cell_of_voxel(truth, fine)] * noise, truth.affine)
 
 # %%
-# The law is 1/strain, scaled so that the stress is 0.1 kPa; ``max`` keeps noise around 0 from making moduli infinite.
-# Voxels are noisy, but a cell averages over many, and where the image varies by noise alone no nodes are spent.
+# The modulus mapping is 1/strain, scaled so that the stress is 0.1 kPa; ``max`` keeps noise around 0 from making moduli
+# infinite. Voxels are noisy, but a cell averages over many, and where the image varies by noise alone no nodes are
+# spent.
 
 mesh = tetopt.mesh_image(strain, nodes=400).mesh
 model = tetopt.build_model(mesh, strain, young="0.1/max(abs(h), 0.001)", nu=0.45)

@@ -26,11 +26,11 @@ print(len(mesh.points), "nodes,", len(mesh.cells), "tetrahedra")
 
 # %%
 # Each cell stands for one value, the mean of its voxels. What varies around these means is lost to a simulation: E_D is
-# that variance times the volume, and it is told as a share of the variance of the whole image. 0.01 means that the
+# that variance times the volume, and it is given as a fraction of the variance of the whole image. 0.01 means that the
 # cells keep 99 % of it.
 
-share = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
-print(f"{share:.5f} of the variance is left inside the cells")
+fraction = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
+print(f"{fraction:.5f} of the variance is left inside the cells")
 
 # %%
 # The mesh cut through the middle of both spheres, each cell in the colour of its mean. Whole cells are shown, so that

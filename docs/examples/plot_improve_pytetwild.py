@@ -35,8 +35,8 @@ before = tetopt.Mesh.from_meshio(meshio.Mesh(points, [("tetra", cells)]))
 after = tetopt.mesh_image(image, start=before, k_D=0.2).mesh
 for name, mesh in (("pytetwild's", before), ("improved", after)):
     shape = tetopt.quality(mesh.points, mesh.cells)
-    share = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
-    print(f"{name:11}: {len(mesh.points)} nodes, {share:.4f} left, angles from {shape.min_dihedral:.1f} degrees")
+    fraction = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
+    print(f"{name:11}: {len(mesh.points)} nodes, {fraction:.4f} left, angles from {shape.min_dihedral:.1f} degrees")
 
 # %%
 # With the same nodes on the boundary, and as many inside, a good quarter of the variance in the cells remains.

@@ -25,26 +25,26 @@ meshes = [tetopt.mesh_image(image, nodes=500, k_D=weight).mesh for weight in wei
 # %%
 # rho is the shape of a cell, inradius over circumradius; a regular triangle has 1/2, a flat one 0.
 
-shares = [tetopt.E_D(image, mesh) / (image.data.var() * image.volume) for mesh in meshes]
+fractions = [tetopt.E_D(image, mesh) / (image.data.var() * image.volume) for mesh in meshes]
 shapes = [tetopt.quality(mesh.points, mesh.cells).mean_rho for mesh in meshes]
-for weight, share, rho in zip(weights, shares, shapes, strict=True):
-    print(f"k_D = {weight}: {share:.4f} of the variance left, mean rho {rho:.3f}")
+for weight, fraction, rho in zip(weights, fractions, shapes, strict=True):
+    print(f"k_D = {weight}: {fraction:.4f} of the variance left, mean rho {rho:.3f}")
 
 # %%
 # From 0.2 to the default the error falls by the part that is printed here, and the mean shape with it. No angle falls
-# below the floor of 12 degrees at any weight.
+# below the minimum of 12 degrees at any weight.
 
-gain = 1.0 - shares[2] / shares[0]
+gain = 1.0 - fractions[2] / fractions[0]
 print(f"k_D = 0.85 leaves {gain:.1%} less than k_D = 0.2")
 
 # %%
 # The four meshes.
 
 figure, axes = plt.subplots(2, 2, figsize=(9, 9), layout="constrained")
-for ax, weight, mesh, share, rho in zip(axes.flat, weights, meshes, shares, shapes, strict=True):
+for ax, weight, mesh, fraction, rho in zip(axes.flat, weights, meshes, fractions, shapes, strict=True):
     means = tetopt.cell_moments(image, mesh).mean
     ax.tripcolor(*mesh.points.T, mesh.cells, means, cmap="bone", edgecolors="#c2622d", linewidth=0.4)
     ax.set_aspect("equal")
     ax.axis("off")
-    ax.set_title(f"k_D = {weight}: {share:.3f} left, rho {rho:.3f}")
+    ax.set_title(f"k_D = {weight}: {fraction:.3f} left, rho {rho:.3f}")
 plt.show()

@@ -53,7 +53,7 @@ def load_of(model, load):
 def sofa(model):
     """A scene for SOFA v24.12, which rests in equilibrium at t = 2 s."""
     if model.mesh.ndim != 3 or model.materials is None or any(load.step for load in model.loads):
-        raise tetopt.InputError("sofa: expected tetrahedra, a law of the modulus (`young`) and loads of one step")
+        raise tetopt.InputError("sofa: expected tetrahedra, a modulus mapping (`young`) and loads of one step")
     mesh, materials = model.mesh, model.materials
     gravity = sum((load.numbers for load in model.loads if load.kind == "gravity"), np.zeros(3))
     root = ET.Element("Node", name="root", dt="0.1", gravity=listed(gravity))

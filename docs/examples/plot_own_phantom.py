@@ -2,8 +2,8 @@
 A phantom of one's own
 ======================
 
-A phantom is a table of shapes with exactly known intensities. It is the quickest way to try a mesh, a material law or
-a simulation on something whose answer is known.
+A phantom is a table of shapes with exactly known intensities. It is the quickest way to try a mesh, a modulus mapping
+or a simulation on something whose answer is known.
 """
 
 import tempfile

@@ -24,13 +24,13 @@ aligned = tetopt.optimize_paper(image, start, k_D=0.5, iterations=15).mesh
 # at the same number of nodes.
 
 
-def share(mesh):
+def fraction(mesh):
     """Part of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
-print(f"lattice {share(start):.3f}, shape alone {share(shape_alone):.3f}, aligned {share(aligned):.3f}")
-left_of_lattice = share(aligned) / share(start)
+print(f"lattice {fraction(start):.3f}, shape alone {fraction(shape_alone):.3f}, aligned {fraction(aligned):.3f}")
+left_of_lattice = fraction(aligned) / fraction(start)
 print(f"the aligned mesh leaves {left_of_lattice:.3f} of what the lattice leaves")
 
 # %%
@@ -43,5 +43,5 @@ for ax, (name, mesh) in zip(axes, meshes.items(), strict=True):
     ax.tripcolor(*mesh.points.T, mesh.cells, means, cmap="cividis", edgecolors="#e8e2d0", linewidth=0.5)
     ax.set_aspect("equal")
     ax.axis("off")
-    ax.set_title(f"{name}: {share(mesh):.3f}")
+    ax.set_title(f"{name}: {fraction(mesh):.3f}")
 plt.show()

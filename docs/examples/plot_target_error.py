@@ -2,7 +2,7 @@
 As many nodes as an error takes
 ===============================
 
-Instead of a number of nodes, a run can be given the share of the image's variance that may be left inside the cells.
+Instead of a number of nodes, a run can be given the fraction of the image's variance that may be left inside the cells.
 It takes the nodes that this needs.
 """
 
@@ -23,13 +23,13 @@ image = tetopt.Image(template.get_fdata()[:, :, k], template.affine[np.ix_([0, 1
 # First the error against the number of nodes, each mesh from its own octree (in 2-D a quadtree).
 
 
-def share(mesh):
+def fraction(mesh):
     """Part of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
 numbers = [100, 200, 400, 800, 1600]
-errors = [share(tetopt.mesh_image(image, nodes=number).mesh) for number in numbers]
+errors = [fraction(tetopt.mesh_image(image, nodes=number).mesh) for number in numbers]
 for number, error in zip(numbers, errors, strict=True):
     print(f"{number:5} nodes leave {error:.4f}")
 
@@ -38,7 +38,7 @@ for number, error in zip(numbers, errors, strict=True):
 
 result = tetopt.mesh_image(image, target_error=0.03)
 needed = result.nodes
-print(f"{needed} nodes leave {share(result.mesh):.4f}, 0.03 at most as was asked for")
+print(f"{needed} nodes leave {fraction(result.mesh):.4f}, 0.03 at most as was asked for")
 
 # %%
 # The mesh that leaves 0.03, and where it lies on the curve.
@@ -50,8 +50,8 @@ left.set_aspect("equal")
 left.axis("off")
 left.set_title(f"{needed} nodes")
 right.loglog(numbers, errors, "o-", color="#2f6db5", label="mesh_image(image, nodes=...)")
-right.loglog([needed], [share(result.mesh)], "*", color="#d95f02", markersize=16, label="target_error=0.03")
+right.loglog([needed], [fraction(result.mesh)], "*", color="#d95f02", markersize=16, label="target_error=0.03")
 right.axhline(0.03, color="#d95f02", linewidth=0.8)
-right.set(xlabel="nodes", ylabel="share of the variance left inside cells")
+right.set(xlabel="nodes", ylabel="fraction of the variance left inside cells")
 right.legend()
 plt.show()

@@ -31,19 +31,21 @@ meshes = {
 }
 
 
-def share(image, mesh):
+def fraction(image, mesh):
     """Part of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
 for name, mesh in meshes.items():
-    print(f"mesh {name:13}: {share(first, mesh):.4f} of the first, {share(second, mesh):.4f} of the second is left")
+    print(
+        f"mesh {name:13}: {fraction(first, mesh):.4f} of the first, {fraction(second, mesh):.4f} of the second is left"
+    )
 
 # %%
 # The mesh of both is nearly as good for each contrast as the mesh of that one, and much better for the other.
 
 both = meshes["of both"]
-worst = max(share(first, both), share(second, both))
+worst = max(fraction(first, both), fraction(second, both))
 print(f"at most {worst:.4f} is left of either contrast")
 
 # %%

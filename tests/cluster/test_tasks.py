@@ -49,7 +49,7 @@ def threads(_name):
     return numba.config.NUMBA_NUM_THREADS, numba.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS")
 
 
-def test_each_name_is_run_with_the_threads_of_its_share_and_measured(run, crew, monkeypatch):
+def test_each_name_is_run_with_its_part_of_the_threads_and_measured(run, crew, monkeypatch):
     monkeypatch.setenv("NUMBA_NUM_THREADS", "7")  # of the user's own, for this process
     done = run(threads, list("abcd"))
     assert {name: each.result[:2] for name, each in done.items()} == dict.fromkeys("abcd", (1, 1))

@@ -27,7 +27,7 @@ COMMON = ("--iterations", "1", "--nodes", "60", "--threads", "1")
 N_KILLS = 3  # of the client, in the first half
 LEAVE_SECONDS = 60.0  # until a killed client's workers and runs have gone
 LOW_LOAD = 0.6  # processes that run on average: more, and the speed of two workers is that of the others, too
-MOST_SHARE = 0.6  # of one worker's time that two may take
+MOST_FRACTION = 0.6  # of one worker's time that two may take
 N_TIMED = 40
 FILE_BYTES = 3000  # of the largest file where a disk is full: less than a mesh, more than a log
 KINDS = ("plain", "mask", "labels", "two contrasts")
@@ -37,7 +37,7 @@ FAILURES = {
     "mask beside the image": (1, ("failed", "far.nii.gz"), False),
     "labels beside the image": (1, ("failed", "far.nii.gz"), False),
     "damaged header": (1, ("failed", "image.nii"), False),
-    "promise missed": (2, ("missed", "overlap only by Dice"), False),
+    "requirement violated": (2, ("violated", "overlap only by Dice"), False),
     "killed always": (1, ("failed", "SIGKILL"), True),
     "killed once": (1, ("done", ""), False),
     "disk full": (1, ("failed", "File too large"), True),
@@ -77,7 +77,7 @@ def saved_subject(folder, rng, kind, failure):
         data[40:42] = (99).to_bytes(2, "little")  # NIfTI's dim[0], the number of dimensions: at most 7
         row["image"] = folder / "image.nii"
         row["image"].write_bytes(data)
-    elif failure == "promise missed":
+    elif failure == "requirement violated":
         thin = np.zeros((24, 24, 24))
         thin[4:20, 4:20, 11:13] = thin[11:13, 4:20, 4:20] = 1.0
         tetopt.save_image(path, tetopt.Image(100.0 * thin + np.arange(24.0), image.affine))
@@ -183,7 +183,7 @@ def unlike(out, failures, expected):
     """What is not as it should be, a line each."""
     rows = rows_of(out)
     lines = [f"{key}: no row" for key in expected if key not in rows] + [
-        f"{key}: strange" for key in rows if key not in expected
+        f"{key}: unexpected" for key in rows if key not in expected
     ]
     for key, (status, words) in expected.items():
         row = rows.get(key, {})
@@ -288,7 +288,7 @@ def campaign(folder, n_subjects, seed):
     one, two = timed(folder, "one", n_subjects, "--workers", "1"), timed(folder, "two", n_subjects, "--workers", "2")
     is_idle = load < LOW_LOAD
     note = f"load {load:.1f} before" + ("" if is_idle else f", over {LOW_LOAD}: not judged")
-    too_slow = [f"{two / one:.2f} of the time"] if is_idle and two > MOST_SHARE * one else []
+    too_slow = [f"{two / one:.2f} of the time"] if is_idle and two > MOST_FRACTION * one else []
     yield f"{N_TIMED} subjects, 1 and 2 workers", f"{one:.0f} s and {two:.0f} s, {two / one:.2f}; {note}", too_slow
     rest = processes_of(folder)
     yield "processes left", str(len(rest)), [str(each) for each in rest.values()]

@@ -44,7 +44,7 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
         "sourcedata/sub-07/anat/sub-07_T1w.nii.gz",
     )
     (folder / "sub-02/anat/sub-02_T1w.json").write_text('{"a":')  # never opened
-    (folder / "sub-02" / "layout_config.json").write_text("[")  # nor pybids's own settings of a stranger
+    (folder / "sub-02" / "layout_config.json").write_text("[")  # nor pybids's own settings of an untrusted folder
     (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").unlink()  # as where a DataLad dataset's content is not fetched
     (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").symlink_to("../../../.git/annex/objects/none")
     (folder / "sub-02" / "loop").symlink_to(folder / "sub-02")

@@ -250,15 +250,15 @@ def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, o
 
 def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
     """A worker of a scheduler that others started may be in another one."""
-    (small / "law.csv").write_text("intensity,young\n0,1\n100,5\n")
+    (small / "mapping.csv").write_text("intensity,young\n0,1\n100,5\n")
     monkeypatch.chdir(small)
-    options = RunOptions(young="law.csv")
+    options = RunOptions(young="mapping.csv")
     (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu")
-    assert entry.words() == ("--nodes=60", f"--young={small / 'law.csv'}", "--", str(small / "a.nii.gz"))
+    assert entry.words() == ("--nodes=60", f"--young={small / 'mapping.csv'}", "--", str(small / "a.nii.gz"))
 
 
 def test_threads_are_of_all_subjects(small, capsys):
-    """They are a share of the machine; those of one subject would be passed over."""
+    """They are a part of the machine; those of one subject would be passed over."""
     (small / "t.tsv").write_text("subject\timage\tthreads\n01\ta.nii.gz\t1\n")
     assert "leave the column out" in refused(small, capsys)[0]
 
@@ -285,7 +285,7 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
 
 
 def test_each_subject_has_files_of_its_own(small, monkeypatch):
-    """Though options that several share are checked once; threads are no words of a run, which gets its share."""
+    """Though options that several share are checked once; threads are no words of a run, which gets its part."""
     monkeypatch.chdir(small)
     for name in ("s1.nii", "s2.nii", "m1.nii", "m2.nii"):
         (small / name).write_bytes(b"1")
@@ -301,7 +301,7 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
 
 @pytest.mark.parametrize(("only_failed", "keys"), [(False, ["b", "c", "d"]), (True, ["b"])])
 def test_what_is_chosen(only_failed, keys):
-    states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "missed"}
+    states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "violated"}
     entries = [
         cohort_plan.PlannedSubject(None, key, None, None, SubjectState(status, "")) for key, status in states.items()
     ]
@@ -386,7 +386,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
 
     @contextmanager
     def locked(place, _keys):
-        save_run(place, "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "missed": {}})
+        save_run(place, "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}})
         yield
 
     keys = []

@@ -36,7 +36,7 @@ def test_the_three_files_lie_beside_the_subjects(cohort):
 
 def test_failures_are_on_top_with_their_logs(cohort):
     _, text = cohort
-    assert "100 subjects: 94 done, 1 with a promise missed, 4 failed, 1 not run." in text
+    assert "100 subjects: 94 done, 1 with a violated requirement, 4 failed, 1 not run." in text
     assert text.index("<h2>Failed: 4</h2>") < text.index("<h2>Distributions</h2>") < text.index("<h2>Subjects</h2>")
     failures = re.findall(r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", text[: text.index("<h2>Distributions")])
     early, killed = (
@@ -79,7 +79,7 @@ def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
     _, text = cohort
     words = "Orange is the mesh, blue the outline of the mask, other colours are labels."
     assert text.index("<h2>Subjects</h2>") < text.index(words) < text.index('<div id="subjects">')
-    save_run(tmp_path, "sub-1", {"missed": {}})
+    save_run(tmp_path, "sub-1", {"violated": {}})
     save_cohort_files(tmp_path, collect(tmp_path))
     assert words not in (tmp_path / "cohort.html").read_text(encoding="utf-8")  # there is no picture
 
@@ -162,7 +162,7 @@ def test_a_browser_sorts_and_filters(cohort, tmp_path):
     said = re.findall(r'<p class="said">([^<]*)</p>', made)
     rows = [row for row in collect(out) if row.numbers.get("quality.mean_rho") is not None]
     rising = [row.key for row in sorted(rows, key=lambda row: float(f"{row.numbers['quality.mean_rho']:.4g}"))]
-    assert said[0].startswith(key_of(43))  # a promise missed
+    assert said[0].startswith(key_of(43))  # a requirement violated
     assert said[3] == said[0]
     assert said[1].split()[0] == rising[0]
     assert said[2].split()[0] == rising[-1]
@@ -213,7 +213,7 @@ def test_without_scripts_there_is_a_table(cohort):
 
 def test_a_picture_that_is_none_of_ours_stays_out(tmp_path):
     big = np.random.default_rng(0).bytes(40_000)
-    save_run(tmp_path, "sub-1", {"missed": {}}, big)
-    save_run(tmp_path, "sub-2", {"missed": {}}, thumbnail(np.random.default_rng(0)))
+    save_run(tmp_path, "sub-1", {"violated": {}}, big)
+    save_run(tmp_path, "sub-2", {"violated": {}}, thumbnail(np.random.default_rng(0)))
     save_cohort_files(tmp_path, collect(tmp_path))
     assert list(data_of((tmp_path / "cohort.html").read_text(encoding="utf-8"))["pictures"]) == ["1"]

@@ -42,7 +42,7 @@ def test_each_kind_of_odd_subject():
     assert flagged(flipped) == [("grid.orientation", "orientation LPS: 19 of 20 have RAS")]
     assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): no cell has it, 350 voxels do")]
     assert flagged({"absent": 53}) == [("label", "no label 53 in its image: 19 of 20 have it")]
-    assert flagged({}, missed=("floor",)) == [("missed", "missed floor")]
+    assert flagged({}, violated=("min_dihedral",)) == [("violated", "violated min_dihedral")]
     [(column, words)] = flagged({"affine": OBLIQUE})
     assert column == "grid.oblique_degrees"
     assert words == "obliqueness is 25.8 degrees, far above the others' median 0 degrees (13 robust deviations)"
@@ -62,9 +62,9 @@ def test_the_median_is_that_of_the_others():
     assert "the others' median 1.01 l" in flag.words
 
 
-def test_a_missed_label_is_told_once():
-    """Which one it is, not also that a promise about labels is missed."""
-    assert flagged({"lost": 17}, missed=("labels",)) == flagged({"lost": 17})
+def test_a_lost_label_is_told_once():
+    """Which one it is, not also that a requirement about labels is violated."""
+    assert flagged({"lost": 17}, violated=("labels",)) == flagged({"lost": 17})
 
 
 def test_a_label_that_few_have():

@@ -53,7 +53,7 @@ def test_rows_are_those_there_and_those_expected(cohort):
 def test_sessions_and_what_is_no_subject(tmp_path):
     save_run(tmp_path, "sub-2_ses-b", run_of(RNG))
     save_run(tmp_path, "sub-10", run_of(RNG))
-    save_run(tmp_path, "sub-2_ses-a", run_of(RNG, missed={"floor": "two\nlines", "box": "out"}))
+    save_run(tmp_path, "sub-2_ses-a", run_of(RNG, violated={"min_dihedral": "two\nlines", "box": "out"}))
     save_failure(tmp_path, "sub-1", "x")
     save_failure(tmp_path, "other", "x")
     (tmp_path / "sub-<b>").mkdir()
@@ -61,8 +61,8 @@ def test_sessions_and_what_is_no_subject(tmp_path):
     rows = collect(tmp_path)
     assert [row.key for row in rows] == ["sub-1", "sub-2_ses-a", "sub-2_ses-b", "sub-10"]
     assert rows[1].files["mesh"] == "sub-2/ses-a/sub-2_ses-a_desc-tetopt_mesh.vtu"
-    assert (rows[1].status, rows[1].missed) == ("missed", ("floor", "box"))
-    assert rows[1].reason == r"floor: two\nlines; box: out"
+    assert (rows[1].status, rows[1].violated) == ("violated", ("min_dihedral", "box"))
+    assert rows[1].reason == r"min_dihedral: two\nlines; box: out"
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"a": NaN', "\x00"])
@@ -112,7 +112,7 @@ def test_numbers_have_names_with_dots():
     assert columns["interfaces.0.area"] == 1000.0
     assert columns["request.options.young"] == "3.0"
     assert "request.options.nodes" not in columns
-    left_out = ("history", "sets", "missed", "box", "label_names", "inputs.sha256", "labels.0.label")
+    left_out = ("history", "sets", "violated", "box", "label_names", "inputs.sha256", "labels.0.label")
     assert [name for name in columns if name.startswith(left_out)] == []
 
 

@@ -70,7 +70,7 @@ def test_a_refused_subject_is_one_line_and_no_files(job, tmp_path):
     assert ended.reason in log_path(out, "sub-1").read_text()
 
 
-def test_a_mesh_that_misses_a_promise_is_a_mesh(job, tmp_path):
+def test_a_mesh_that_violates_a_requirement_is_a_mesh(job, tmp_path):
     """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1."""
     inside = np.zeros((24, 24, 24))
     inside[4:20, 4:20, 11:13] = inside[11:13, 4:20, 4:20] = 1.0
@@ -78,7 +78,7 @@ def test_a_mesh_that_misses_a_promise_is_a_mesh(job, tmp_path):
     tetopt.save_image(tmp_path / "mask.nii.gz", tetopt.Image(inside))
     words = (f"--mask={tmp_path}/mask.nii.gz", *WORDS, str(tmp_path / "thin.nii.gz"))
     ended = run_subject(job._replace(words=words))
-    assert ended.status == "missed"
+    assert ended.status == "violated"
     assert "overlap only by Dice" in ended.reason
     assert subject_folder(tmp_path / "out", "sub-1").is_dir()
     assert not failure_path(tmp_path / "out", "sub-1").exists()

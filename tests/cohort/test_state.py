@@ -6,7 +6,7 @@ import pytest
 from cohorts import save_failure, save_run
 
 from tetopt.cohort.layout import begin, description, mesh_name, numbers_path, subject_folder
-from tetopt.cohort.state import SubjectState, differences, state_of, strangers
+from tetopt.cohort.state import SubjectState, differences, foreign_files, state_of
 
 KEY = "sub-1"
 
@@ -22,8 +22,8 @@ def out(tmp_path):
     return tmp_path / "out"
 
 
-def saved(out, key=KEY, suffix=".vtu", missed=None, **changes):
-    save_run(out, key, {"request": request(**changes), "missed": missed or {}}, suffix=suffix)
+def saved(out, key=KEY, suffix=".vtu", violated=None, **changes):
+    save_run(out, key, {"request": request(**changes), "violated": violated or {}}, suffix=suffix)
 
 
 def status(out, now=None, key=KEY):
@@ -37,8 +37,8 @@ def test_each_status_has_its_reason(out):
     other = request(options={"nodes": 70, "format": ".vtu"})
     assert status(out, other) == SubjectState("changed", "nodes was 60, is 70")
     assert state_of(out, KEY, ".vtu", None) == SubjectState("done", "")
-    saved(out, missed={"floor": "too flat", "mask": "too coarse"})
-    assert status(out) == SubjectState("missed", "too flat; too coarse")
+    saved(out, violated={"min_dihedral": "too flat", "mask": "too coarse"})
+    assert status(out) == SubjectState("violated", "too flat; too coarse")
 
 
 def test_a_failure_counts_until_there_is_what_is_asked_for(out):
@@ -55,7 +55,7 @@ def test_a_failure_counts_until_there_is_what_is_asked_for(out):
     lambda mesh, numbers: numbers.write_text('{"request": '), lambda mesh, numbers: numbers.write_text("[]"),
     lambda mesh, numbers: numbers.write_bytes(b""), lambda mesh, numbers: mesh.write_bytes(b""),
     lambda mesh, numbers: numbers.write_text('{"request": 3}'),
-    lambda mesh, numbers: numbers.write_text('{"request": {"format": 3}, "missed": 4}'),
+    lambda mesh, numbers: numbers.write_text('{"request": {"format": 3}, "violated": 4}'),
 ])  # fmt: skip
 def test_what_is_damaged_is_made_again(out, harm):
     saved(out)
@@ -79,17 +79,17 @@ def test_differences_are_said_and_the_line_is_short():
     )
 
 
-def test_strangers_in_a_subjects_place(out):
-    assert strangers(out, KEY) is None
+def test_foreign_files_in_a_subjects_place(out):
+    assert foreign_files(out, KEY) is None
     saved(out)
-    assert strangers(out, KEY) is None
+    assert foreign_files(out, KEY) is None
     (out / KEY / "ses-a").mkdir()
-    assert "has sessions, ses-a among them" in strangers(out, KEY)
+    assert "has sessions, ses-a among them" in foreign_files(out, KEY)
     (out / "sub-2" / "ses-a").mkdir(parents=True)
-    assert "has sessions" in strangers(out, "sub-2")
-    assert strangers(out, "sub-2_ses-b") is None
+    assert "has sessions" in foreign_files(out, "sub-2")
+    assert foreign_files(out, "sub-2_ses-b") is None
     (out / "sub-3").mkdir()
     (out / "sub-3" / "thesis.txt").touch()
-    assert "no subject's of this cohort" in strangers(out, "sub-3")
+    assert "no subject's of this cohort" in foreign_files(out, "sub-3")
     (out / "sub-4").touch()
-    assert "no subject's of this cohort" in strangers(out, "sub-4")
+    assert "no subject's of this cohort" in foreign_files(out, "sub-4")

@@ -33,14 +33,14 @@ def test_a_table_says_what_is_meshed(tmp_path):
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
 
 
-def test_files_of_laws_are_relative_to_the_table(tmp_path):
+def test_files_of_mappings_are_relative_to_the_table(tmp_path):
     path = table(tmp_path / "s.tsv", "subject\timage\tyoung\tnu\tdensity", "1\ta.nii\tlaw.csv\t0.3\t../rho.TOML")
     (row,) = read_table(path)
-    laws = {"young": str(tmp_path / "law.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
-    assert row.options == laws
+    mappings = {"young": str(tmp_path / "mapping.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
+    assert row.options == mappings
     (tmp_path / "inner").mkdir()
     write_table(tmp_path / "inner" / "u.tsv", [row])
-    assert "\t../../rho.TOML\t0.3\t../law.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()
+    assert "\t../../rho.TOML\t0.3\t../mapping.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()
 
 
 @pytest.mark.parametrize(("suffix", "lines"), [

@@ -88,8 +88,8 @@ def test_filters_are_scipys_to_the_last_bit(shape):
             gaussian(level.T, sigma).tobytes()
             == gaussian_filter(level.T, sigma, mode="nearest", truncate=3.0).tobytes()
         )
-    for share in (0.5, 0.97, 0.995):
-        inside = rng.random(shape) < share
+    for fraction in (0.5, 0.97, 0.995):
+        inside = rng.random(shape) < fraction
         inside.flat[3] = False
         twin = np.minimum(distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
         assert near_distance(inside).tobytes() == twin.tobytes()

@@ -114,9 +114,9 @@ def test_E_D_of_a_linear_image_converges_with_the_voxels(n, kind, gradient, orde
 def test_E_D_of_the_sphere_is_the_analytic_one():
     """A ball of radius r = 20 mm and contrast c = 80 in a box of V = 64^3 mm^3, cut into 12 cells by its centre.
 
-    By symmetry every cell has the ball's share f = 4/3 pi r^3 / V, so E_D = V f (1 - f) c^2.
+    By symmetry every cell has the ball's fraction f = 4/3 pi r^3 / V, so E_D = V f (1 - f) c^2.
 
-    Voxels on the sphere hold a mean, and their own variance is lost: c^2 p (1 - p) each, p the ball's share of
+    Voxels on the sphere hold a mean, and their own variance is lost: c^2 p (1 - p) each, p the ball's fraction of
     the voxel. Integrated along the normal u a voxel loses E|u . (X - Y)| / 2, X and Y random in it: 1/6 for a voxel
     face on, 0.2887 / sqrt(pi) = 0.163 for the sum of many coordinates. Taken as 0.1645 +- 0.002, times 4 pi r^2 c^2,
     it is 2.83 % of E_D, sure to 0.04 %. The cells are ragged: centres lie on their walls, counts differ by

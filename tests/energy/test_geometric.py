@@ -21,9 +21,9 @@ from meshes import (
 )
 
 from tetopt import E_G, Image, lattice_mesh
-from tetopt.energy.geometric import E_G_gradient, cell_E_G, ring_volumes, volume_and_E_G
+from tetopt.energy.geometric import E_G_gradient, cell_E_G, star_volumes, volume_and_E_G
 from tetopt.geometry.simplex import oriented, volumes
-from tetopt.geometry.topology import boundary_facets, rings
+from tetopt.geometry.topology import boundary_facets, stars
 
 pytestmark = pytest.mark.kernel
 
@@ -110,11 +110,11 @@ def test_E_G_far_from_the_origin_loses_nothing(mesh):
 
 
 @given(seeds, dimensions)
-def test_ring_volumes_add_up_to_n_plus_1_times_the_volume(seed, n):
+def test_star_volumes_add_up_to_n_plus_1_times_the_volume(seed, n):
     _, points, cells = random_mesh(seed, n)
     v = volumes(points, cells)
-    expected = [sum(v[c] for c in ring) for ring in naive.rings(cells, len(points) + 1)]
-    around = ring_volumes(np.vstack([points, points[:1]]), cells)  # the last node is in no cell
+    expected = [sum(v[c] for c in star) for star in naive.stars(cells, len(points) + 1)]
+    around = star_volumes(np.vstack([points, points[:1]]), cells)  # the last node is in no cell
     assert around == pytest.approx(expected)
     assert around.sum() == pytest.approx((n + 1) * 3**n)
 
@@ -140,17 +140,17 @@ def test_gradient_is_that_of_central_differences(seed, n):
 
 @given(seeds, dimensions)
 def test_gradient_at_inner_nodes_points_from_the_weighted_circumcentres(seed, n):
-    """dE_G/dx_i = 2 |Omega_i| / (n + 1) (x_i - c_i), c_i the volume-weighted mean of the ring's circumcentres."""
+    """dE_G/dx_i = 2 |Omega_i| / (n + 1) (x_i - c_i), c_i the volume-weighted mean of the star's circumcentres."""
     _, points, cells = random_mesh(seed, n)
     v, centres = volumes(points, cells), naive.circumcentres(points, cells)
     gradient = E_G_gradient(points, cells)
-    around = rings(cells, len(points))
+    around = stars(cells, len(points))
     inner = np.setdiff1d(np.arange(len(points)), boundary_facets(cells))
     for node in inner:
-        ring = around.cells[around.start[node] : around.start[node + 1]]
-        mean = v[ring] @ centres[ring] / v[ring].sum()
-        expected = 2 * v[ring].sum() / (n + 1) * (points[node] - mean)
-        np.testing.assert_allclose(gradient[node], expected, atol=1e-9 * (1 + np.abs(centres[ring]).max()))
+        star = around.cells[around.start[node] : around.start[node + 1]]
+        mean = v[star] @ centres[star] / v[star].sum()
+        expected = 2 * v[star].sum() / (n + 1) * (points[node] - mean)
+        np.testing.assert_allclose(gradient[node], expected, atol=1e-9 * (1 + np.abs(centres[star]).max()))
 
 
 @pytest.mark.parametrize("kind", ["bcc", "five-tet", "criss-cross"])

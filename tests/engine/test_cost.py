@@ -14,10 +14,10 @@ def test_the_model_is_complete_and_sane():
     assert set(model.seconds) == {*cost.once_terms(SIZE), *cost.swept_terms(SIZE)}
     assert set(model.bytes) == set(cost.memory_terms(SIZE))
     assert min(*model.seconds.values(), *model.bytes.values()) >= 0.0
-    assert 0.0 < model.parallel_share <= 1.0
+    assert 0.0 < model.parallel_fraction <= 1.0
     assert model.calibration_seconds > 0.0
     assert model.seconds_factor > 1.0
-    assert 0.0 < model.bytes_share
+    assert 0.0 < model.bytes_fraction
 
 
 @pytest.mark.parametrize("mode", ["graded", "uniform", "paper", "start"])

@@ -9,7 +9,7 @@ from states import OBLIQUE, Engine, assumed_case, random_case
 from test_fast import dimensions, seeds
 
 import tetopt
-from tetopt.engine.complex import energies, node_rings
+from tetopt.engine.complex import energies, node_stars
 from tetopt.engine.density import (
     EdgeMoves,
     Limits,
@@ -80,17 +80,17 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                 fix_boundary(engine)
             if node >= N:
                 continue
-            rings, groups = node_rings(engine.state), blocks(engine.complex.ticks)
+            stars, groups = node_stars(engine.state), blocks(engine.complex.ticks)
             was_frozen, E, everyone = engine.complex.is_frozen, engine.E, np.ones(N, dtype=bool)
             room = roomy(engine.state, N, 200)
             is_dirty = np.zeros(len(room.complex.cells), dtype=np.bool_)
             if kind == "split":
-                splits = best_splits(room, rings, everyone, no_limits(N))
+                splits = best_splits(room, stars, everyone, no_limits(N))
                 if splits.other[node] < 0:
                     continue
                 nobody = np.empty(0, dtype=np.int64)
                 none = EdgeMoves(everyone, np.full(N, -1), np.full(N, -np.inf))
-                made = make_exchanges(room, rings, splits, none, np.array([node]), nobody, (1, 1, 0.0), is_dirty)
+                made = make_exchanges(room, stars, splits, none, np.array([node]), nobody, (1, 1, 0.0), is_dirty)
                 assert made == (1, 0)
                 expected = splits.gain[node]
                 was_on, is_frozen = was_frozen[[node, splits.other[node]]], room.complex.is_frozen
@@ -100,10 +100,10 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                 engine.state = room
                 engine.change(ticks=room.complex.ticks[: N + 1], is_frozen=is_frozen[: N + 1])
             else:
-                collapses = best_collapses(room, rings, groups, everyone, no_limits(N))
+                collapses = best_collapses(room, stars, groups, everyone, no_limits(N))
                 if collapses.other[node] < 0:
                     continue
-                collapse_edge(room, rings, node, collapses.other[node], is_dirty)
+                collapse_edge(room, stars, node, collapses.other[node], is_dirty)
                 close_gaps(room, is_dirty)
                 expected = collapses.gain[node]
                 engine.state = room
@@ -122,17 +122,17 @@ def test_splits_make_no_edge_shorter_than_asked():
     engine = random_case(5, 3)
     engine.sweep()
     N = len(engine.complex.ticks)
-    rings, room = node_rings(engine.state), roomy(engine.state, N, 200)
+    stars, room = node_stars(engine.state), roomy(engine.state, N, 200)
     points, cells = engine.mesh.points, engine.mesh.cells
     shortest = 0.45 * float(np.median(np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1)))
     made = []
     for limit in (0.0, shortest):
-        split = best_splits(room, rings, np.ones(N, dtype=bool), no_limits(N)._replace(shortest=limit)).other
+        split = best_splits(room, stars, np.ones(N, dtype=bool), no_limits(N)._replace(shortest=limit)).other
         lengths = []
         for a in np.flatnonzero(split >= 0):
-            ring = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
+            star = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
             middle = (points[a] + points[split[a]]) / 2.0
-            lengths.append(np.linalg.norm(points[np.unique(ring)] - middle, axis=1).min())
+            lengths.append(np.linalg.norm(points[np.unique(star)] - middle, axis=1).min())
         made.append(np.array(lengths))
     assert made[0].min() < 0.95 * shortest
     assert len(made[1]) > 0
@@ -153,9 +153,9 @@ def test_edges_too_long_for_their_targets_are_split_first(n):
     np.testing.assert_array_equal(too_long(engine.state, target), expected)
     assert 0 < sum(expected) < N
     assert not too_long(engine.state, np.full(N, np.inf)).any()
-    rings, room = node_rings(engine.state), roomy(engine.state, N, 200)
+    stars, room = node_stars(engine.state), roomy(engine.state, N, 200)
     limits = no_limits(N)._replace(target=target)
-    plain, sized = (best_splits(room, rings, np.ones(N, dtype=bool), each) for each in (no_limits(N), limits))
+    plain, sized = (best_splits(room, stars, np.ones(N, dtype=bool), each) for each in (no_limits(N), limits))
     is_long = np.zeros(N, dtype=bool)
     for a in np.flatnonzero(sized.other >= 0):
         b = sized.other[a]
@@ -184,11 +184,11 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     engine = random_case(11, 3)
     engine.sweep()
     N, cells = len(engine.complex.ticks), engine.mesh.cells
-    rings, groups = node_rings(engine.state), blocks(engine.complex.ticks)
+    stars, groups = node_stars(engine.state), blocks(engine.complex.ticks)
     points = engine.mesh.points
     longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
     collapses = best_collapses(
-        engine.state, rings, groups, np.ones(N, dtype=bool), no_limits(N)._replace(longest=longest)
+        engine.state, stars, groups, np.ones(N, dtype=bool), no_limits(N)._replace(longest=longest)
     )
     size = np.linalg.det(engine.mesh.points[cells[:, 1:]] - engine.mesh.points[cells[:, :1]]).sum()
     joined, refused = 0, 0
@@ -222,7 +222,7 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
 @settings(max_examples=25, deadline=None)
 @given(seeds, st.booleans())
 def test_mending_by_nodes(seed, turned):
-    """Nodes taken out and put in at the worst cells: fewer cells below the floor, none worse, and a mesh still."""
+    """Nodes taken out and put in at the worst cells: fewer flat cells, none worse, and a mesh still."""
     engine = assumed_case(seed, 3, OBLIQUE if turned else None)
     target = -np.cos(np.radians(20.0))
     for _ in range(3):
@@ -246,7 +246,7 @@ def test_nodes_go_where_the_image_is():
     E_D, nodes_near = {}, {}
     for does_exchange in (False, True):
         engine = Engine(image, tetopt.lattice_mesh(image, blocks=(5, 5, 5)), 0.5, is_graded=True)
-        engine.keep_floor(10.0)
+        engine.keep_min_dihedral(10.0)
         N, geometry = len(engine.complex.ticks), engine.objective.geometry
         for _ in range(8):
             engine.sweep()

@@ -86,7 +86,7 @@ def assert_sound(result, image, labels, mask, order=1):
     fields = tetopt.cell_fields(mesh, image)
     if labels is not None:  # at whatever iteration it ended
         problems = manifold_problems(mesh, result.labels) + ([] if mask is None else manifold_problems(mesh))
-        assert bool(problems) == ("manifold" in result.missed)
+        assert bool(problems) == ("manifold" in result.violated)
         assert set(result.labels.tolist()) <= set(labels.data.astype(int).ravel().tolist())
         fields["label"] = result.labels
     measured = fidelity(labels, mask, mesh, result.labels)

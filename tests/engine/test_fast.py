@@ -1,4 +1,4 @@
-"""The fast engine: its gradients, its moves, its floor, and its laws on phantoms."""
+"""The fast engine: its gradients, its moves, its minimum angle, and its laws on phantoms."""
 
 import numba
 import numpy as np
@@ -15,11 +15,11 @@ from tetopt.energy.discretization import cell_E_D
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks
 from tetopt.engine import flips
-from tetopt.engine.complex import build, cell_squares, cosine_up_to_floor, energies, node_rings, remeasure
+from tetopt.engine.complex import build, cell_squares, cosine_up_to_limit, energies, node_stars, remeasure
 from tetopt.engine.fast import Run
 from tetopt.engine.repair import n_cells_below
 from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient, gradient
-from tetopt.engine.state import floor_of
+from tetopt.engine.state import angle_limit_of
 from tetopt.geometry.simplex import dihedral_angles, oriented
 from tetopt.geometry.topology import boundary_facets
 
@@ -34,7 +34,7 @@ def smooth_image(shape, affine=None):
     return tetopt.Image(100.0 * data, affine)
 
 
-def test_cells_that_are_surely_above_a_floor():
+def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
     """The bound by the shape measure never lets one through that is below, and lets most regular ones through."""
     rng = np.random.default_rng(4)
     corners = rng.normal(size=(20_000, 4, 3))
@@ -50,13 +50,13 @@ def test_cells_that_are_surely_above_a_floor():
     corners[mirrored] = corners[mirrored][:, [1, 0, 2, 3]]
     angles = dihedral_angles(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)).min(axis=1)
     objective = random_case(1, 3).objective
-    for floor in (5.0, 12.0, 40.0):
-        cosine, safe = floor_of(floor)
-        cosines = np.array([cosine_up_to_floor(x, objective._replace(floor=cosine, safe=safe)) for x in corners])
-        assert (angles[cosines >= cosine] >= floor * (1 - 1e-12)).all()
+    for min_dihedral in (5.0, 12.0, 40.0):
+        cosine, safe = angle_limit_of(min_dihedral)
+        cosines = np.array([cosine_up_to_limit(x, objective._replace(angle_limit=cosine, safe=safe)) for x in corners])
+        assert (angles[cosines >= cosine] >= min_dihedral * (1 - 1e-12)).all()
         np.testing.assert_allclose(cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9)
-    objective = objective._replace(floor=-0.97, safe=floor_of(12.0)[1])
-    assert (np.array([cosine_up_to_floor(x, objective) for x in corners[:2000]]) == -0.97).mean() > 0.5
+    objective = objective._replace(angle_limit=-0.97, safe=angle_limit_of(12.0)[1])
+    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:2000]]) == -0.97).mean() > 0.5
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -77,7 +77,7 @@ def test_squares_of_cells(n):
 def test_shape_gradient(n, power):
     """Against central differences; with p = 1 also against E_G's own gradient."""
     engine = random_case(5, n, OBLIQUE if n == 3 else None, power)
-    shape, _ = gradient(engine.state, node_rings(engine.state))
+    shape, _ = gradient(engine.state, node_stars(engine.state))
     mesh = engine.mesh
 
     def energy(points):
@@ -106,13 +106,13 @@ def test_shape_curvature(n, is_graded):
     """Against central differences of the gradient."""
     engine = random_case(5, n, OBLIQUE if n == 3 else None, 2.2)
     state = engine.state._replace(objective=engine.objective._replace(is_graded=is_graded))
-    rings, matrix = node_rings(state), state.objective.matrix * 2.0**-state.objective.bits  # mm per tick
+    stars, matrix = node_stars(state), state.objective.matrix * 2.0**-state.objective.bits  # mm per tick
     step = int(1e-4 / np.abs(matrix).max())
 
     def derivatives(node):
         g, H = np.zeros(3), np.zeros((3, 3))
         remeasure(state)
-        _add_shape_gradient(g, H, np.empty((4, 3)), state, rings, node)
+        _add_shape_gradient(g, H, np.empty((4, 3)), state, stars, node)
         return g, H
 
     for node in range(0, len(state.complex.ticks), 5):
@@ -135,10 +135,10 @@ def test_image_curvature_at_a_step():
     image = tetopt.Image(data)
     mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     engine = Engine(image, mesh, 0.5)
-    rings = node_rings(engine.state)
+    stars = node_stars(engine.state)
     for node in range(len(mesh.points)):
         g, H = np.zeros(3), np.zeros((3, 3))
-        _add_image_gradient(g, H, engine.state, rings, node)
+        _add_image_gradient(g, H, engine.state, stars, node)
         assert np.linalg.eigvalsh(H).min() >= -1e-12 * np.abs(H).max()
         if abs(mesh.points[node, 0] - 20.0) < 1.0:
             assert H[0, 0] > 0.0
@@ -156,7 +156,7 @@ def test_image_gradient_on_smooth_images(n, turned):
     image = smooth_image(shape, None if not turned else np.diag([1.0, -0.5, 2.0, 1.0]))
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     engine = Engine(image, mesh, 0.5)
-    _, image_gradient = gradient(engine.state, node_rings(engine.state))
+    _, image_gradient = gradient(engine.state, node_stars(engine.state))
     inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))
     expected = np.zeros((len(inner), n))
     for row, node in enumerate(inner):
@@ -180,7 +180,7 @@ def test_image_gradient_in_the_mean_on_noise():
     image = tetopt.Image(data)
     mesh = tetopt.lattice_mesh(image, blocks=(5, 5, 5))
     engine = Engine(image, mesh, 0.5)
-    _, image_gradient = gradient(engine.state, node_rings(engine.state))
+    _, image_gradient = gradient(engine.state, node_stars(engine.state))
     inner = np.flatnonzero(~engine.complex.is_frozen.any(axis=1))
     expected = []
     for node in inner:
@@ -220,7 +220,7 @@ def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
         if k_D == 0.0:
             engine.remeasure()
         engine.assert_sound()
-        engine.keep_floor(15.0)
+        engine.keep_min_dihedral(15.0)
         engine.sweep()
         engine.flip()
         assert n_cells_below(engine.state, 15.0) <= repaired.n_below
@@ -289,8 +289,8 @@ def test_a_flip_is_worth_what_it_says():
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("k_D", [0.0, 0.3])
 @pytest.mark.parametrize("boundary", ["slide", "fixed"])
-def test_laws(name, k_D, boundary):
-    """A mesh of the box with every voxel; E falls but where the floor was lifted; the history is of the mesh."""
+def test_mappings(name, k_D, boundary):
+    """A mesh of the box with every voxel; E falls but where cells were lifted; the history is of the mesh."""
     image, blocks = CASES[name]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = tetopt.optimize(image, mesh, k_D=k_D, iterations=8, boundary=boundary)
@@ -310,7 +310,7 @@ def test_laws(name, k_D, boundary):
 
 @pytest.mark.parametrize("name", ["3-D", "oblique"])
 def test_reaches_lower_than_the_paper(name):
-    """With the paper's own energy (p = 1, no floor) the same iterations end lower."""
+    """With the paper's own energy (p = 1, no minimum angle) the same iterations end lower."""
     image, blocks = CASES[name]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     paper = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20)
@@ -332,14 +332,14 @@ def test_same_bits_for_any_number_of_threads():
         assert [row[:-1] for row in other.history] == [row[:-1] for row in results[0].history]
 
 
-def test_floor():
-    """Higher floors are reached too, up to what a coarse ball allows; without one, worse cells are left."""
+def test_the_minimum_dihedral_angle():
+    """Higher ones are reached too, up to what a coarse ball allows; without one, worse cells are left."""
     image, _ = CASES["3-D"]
     mesh = tetopt.lattice_mesh(image, nodes=400)
     worst = {}
-    for floor in (0.0, 12.0, 20.0):
-        made = tetopt.optimize(image, mesh, k_D=0.5, min_dihedral=floor).mesh
-        worst[floor] = dihedral_angles(made.points, made.cells).min()
+    for min_dihedral in (0.0, 12.0, 20.0):
+        made = tetopt.optimize(image, mesh, k_D=0.5, min_dihedral=min_dihedral).mesh
+        worst[min_dihedral] = dihedral_angles(made.points, made.cells).min()
     assert worst[0.0] < 12.0 <= worst[12.0] + 1e-6
     assert worst[20.0] >= 20.0 - 1e-6
 
@@ -359,7 +359,7 @@ def squashed(image, blocks):
 
 @pytest.mark.parametrize("options", [{"iterations": 6}, {"max_seconds": 1e-9}])
 def test_a_bad_start_is_lifted_even_if_time_is_short(options):
-    """The floor is seen to at the end, whatever ends the run; where E rises, it is for that."""
+    """Flat cells are lifted at the end, whatever ends the run; where E rises, it is for that."""
     image, _ = CASES["3-D"]
     mesh = squashed(image, (5, 5, 5))
     assert dihedral_angles(mesh.points, mesh.cells).min() < 9.0
@@ -550,14 +550,14 @@ def test_refuses_doubled_cells():
 
 
 def test_run_measures_what_it_has():
-    """After iterations with floor and flips, the run's complex is what a fresh measurement finds."""
+    """After iterations with lifts and flips, the run's complex is what a fresh measurement finds."""
     image, blocks = CASES["oblique"]
     run = Run(plain(image), tetopt.lattice_mesh(image, blocks=blocks), 0.5)
     for _ in range(3):
         run.sweep()
         run.flip()
     run.lift(20.0)
-    run.keep_floor(20.0)
+    run.keep_min_dihedral(20.0)
     run.sweep()
     run.flip()
     now, n_cells = run.state.complex, run.n_cells

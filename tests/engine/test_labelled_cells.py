@@ -7,13 +7,13 @@ import pytest
 import tetopt
 from tetopt.contents.content import content
 from tetopt.energy.sampling import channel_grid, from_ticks
-from tetopt.engine.complex import cell_squares, energies, interface_energy, node_rings, remeasure
+from tetopt.engine.complex import cell_squares, energies, interface_energy, node_stars, remeasure
 from tetopt.engine.density import Limits, exchange
 from tetopt.engine.flips import flip
 from tetopt.engine.interfaces import relabel, with_labels
 from tetopt.engine.repair import repair
-from tetopt.engine.smooth import attract, blocks, ring_tension, sweep
-from tetopt.engine.state import state_of, with_floor
+from tetopt.engine.smooth import attract, blocks, star_tension, sweep
+from tetopt.engine.state import state_of, with_min_dihedral
 from tetopt.engine.surface import combined_ways, constraint_values
 from tetopt.errors import InputError
 from tetopt.measure.interfaces import label_interfaces
@@ -46,7 +46,7 @@ def labelled_state():
         target = content(CASES[name], labels=CASES[name], weights=[0.0])
         mesh = tetopt.octree_mesh(target, nodes)
         grid = channel_grid(target, mesh.points)
-        state = with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
+        state = with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
         return with_labels(state, target, target.smooth, mesh), target, grid
 
     return made
@@ -84,12 +84,12 @@ def stated_labels(state):
 
 def swept(state):
     n_nodes = len(state.complex.ticks)
-    sweep(state, node_rings(state), blocks(state.complex.ticks), np.ones(n_nodes, dtype=bool))
+    sweep(state, node_stars(state), blocks(state.complex.ticks), np.ones(n_nodes, dtype=bool))
     return state
 
 
 def attracted(state):
-    attract(state, node_rings(state), blocks(state.complex.ticks), -0.99)
+    attract(state, node_stars(state), blocks(state.complex.ticks), -0.99)
     return state
 
 
@@ -177,8 +177,8 @@ def test_interface_energy_is_the_area_between_labels(labelled_state):
         a, b, c = mesh.points[np.intersect1d(mesh.cells[one], mesh.cells[other])]
         total += (value[labels[one]] + value[labels[other]]) * 0.5 * np.linalg.norm(np.cross(b - a, c - a))
     assert interface_energy(state) == pytest.approx(state.objective.tension * total, rel=1e-12)
-    rings = node_rings(state)
-    each = sum(ring_tension(state, rings, node) for node in range(len(mesh.points)))
+    stars = node_stars(state)
+    each = sum(star_tension(state, stars, node) for node in range(len(mesh.points)))
     assert each == pytest.approx(3.0 * interface_energy(state), rel=1e-12)  # each facet has three nodes
 
 
@@ -299,7 +299,7 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
     mesh = tetopt.octree_mesh(target, 300)
     grid = channel_grid(target, mesh.points)
     state = with_labels(
-        with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, target.smooth, mesh
+        with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, target.smooth, mesh
     )
     before = None
     for move in ("attract", "sweep", "flip", "exchange"):
@@ -322,8 +322,8 @@ def test_uniform_meshes_go_on_with_labels():
     assert few.labels is not None
 
 
-def test_floor_within_a_mask():
-    """Nodes are brought between labels without a cell under the floor, which might not be lifted again."""
+def test_the_minimum_dihedral_angle_within_a_mask():
+    """Nodes are brought between labels without a flat cell, which might not be lifted again."""
     image = patches(2, 12, 20)
     at = np.stack(np.meshgrid(*[np.arange(12) - 5.5] * 3, indexing="ij"), axis=-1)
     mask = tetopt.Image((np.linalg.norm(at, axis=-1) < 5.2).astype(float))

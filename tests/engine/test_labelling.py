@@ -11,9 +11,9 @@ import tetopt
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine import labelling
 from tetopt.engine.complex import fill_across
-from tetopt.engine.labelling import keeps_topology, labelled, pieces_of, voxel_pieces
+from tetopt.engine.labelling import components_of, keeps_topology, labelled, voxel_components
 from tetopt.geometry.simplex import oriented, volumes
-from tetopt.geometry.topology import rings
+from tetopt.geometry.topology import stars
 
 
 def across_of(cells, n_nodes):
@@ -27,11 +27,11 @@ def whole(labels, n_labels, size):
     return csr_array((size, (np.arange(len(labels)), labels)), shape=(len(labels), n_labels))
 
 
-def solved(points, cells, labels, n_labels=2, pieces=None, weight=None, counts=None):
+def solved(points, cells, labels, n_labels=2, components=None, weight=None, counts=None):
     """`labelled` of cells that are full of one label each."""
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
-    pieces = [np.array([1])] * n_labels if pieces is None else pieces
-    return labelled(points, cells, across_of(cells, len(points)), counts, pieces, weight)
+    components = [np.array([1])] * n_labels if components is None else components
+    return labelled(points, cells, across_of(cells, len(points)), counts, components, weight)
 
 
 def lattice(n, cubes):
@@ -47,11 +47,11 @@ def box(n, count, seed):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_keeps_topology_as_its_twin(n):
-    """On thousands of random labels: the twin's answer, and where it is yes neither Euler numbers nor pieces change."""
+    """On thousands of random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
     rng, n_kept, n_asked = np.random.default_rng(7), 0, 0
     for seed in range(6):
         points, cells = box(n, 25, seed) if seed % 2 else lattice(n, 2)
-        across, ring = across_of(cells, len(points)), rings(cells, len(points))
+        across, star = across_of(cells, len(points)), stars(cells, len(points))
         for _ in range(8):
             # Half spaces with noise: few cells of pure noise may change.
             place = points[cells].mean(axis=1) @ rng.normal(size=n)
@@ -59,7 +59,7 @@ def test_keeps_topology_as_its_twin(n):
             labels = np.where(rng.random(len(cells)) < 0.1, rng.integers(0, 3, len(cells)), labels)
             for cell in rng.choice(len(cells), 12):
                 for label in {0, 1, 2} - {int(labels[cell])}:
-                    keeps = keeps_topology(cells, across, labels, ring.start, ring.cells, cell, label)
+                    keeps = keeps_topology(cells, across, labels, star.start, star.cells, cell, label)
                     assert keeps == naive.keeps_topology(cells, labels, cell, label)
                     n_asked, n_kept = n_asked + 1, n_kept + keeps
                     if keeps:
@@ -74,7 +74,7 @@ def assert_same_topology(cells, labels, cell, label):
     across = across_of(cells, int(cells.max()) + 1)
     for one in (labels[cell], label):
         assert naive.euler(naive.faces_of(cells[labels == one])) == naive.euler(naive.faces_of(cells[after == one]))
-        n_pieces = [(pieces_of(across, of)[1] == one).sum() for of in (labels, after)]
+        n_pieces = [(components_of(across, of)[1] == one).sum() for of in (labels, after)]
         assert n_pieces[0] == n_pieces[1]
         assert naive.pinched(cells, after, one) == naive.pinched(cells, labels, one)
 
@@ -120,18 +120,18 @@ def test_moves_lower_the_energy(n):
 
 
 def test_a_bridge_is_the_cheapest():
-    """Between two pieces of a label, by the energy of each cell that it takes."""
+    """Between two components of a label, by the energy of each cell that it takes."""
     points, cells = box(3, 16, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
     dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
     labels = voxels.argmax(axis=1)
-    number, of_piece = pieces_of(dual.across, labels)
+    number, of_component = components_of(dual.across, labels)
     way, before, bridge = np.full(len(cells), np.inf), np.empty_like(labels), np.empty_like(labels)
     energy = naive.labelling_energy(voxels, dual.tension, cells, labels)
     n_bridges = 0
-    for piece, label in enumerate(of_piece):
-        sources, ends = np.flatnonzero(number == piece), np.flatnonzero((labels == label) & (number != piece))
+    for component, label in enumerate(of_component):
+        sources, ends = np.flatnonzero(number == component), np.flatnonzero((labels == label) & (number != component))
         if len(ends) == 0 or len(sources) > 4:
             continue
         changed = [np.where(np.arange(len(cells)) == cell, label, labels) for cell in range(len(cells))]
@@ -143,7 +143,7 @@ def test_a_bridge_is_the_cheapest():
         assert costs[bridge[:count]].sum() == pytest.approx(least, abs=1e-6)
         linked = labels.copy()
         linked[bridge[:count]] = label
-        after = pieces_of(dual.across, linked)[0]
+        after = components_of(dual.across, linked)[0]
         assert np.isin(after[ends], after[sources]).any()
         assert np.isinf(way).all()
         n_bridges += 1
@@ -166,12 +166,12 @@ def ball(n_blocks=7, radius=7.5, seed=None):
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1])
-def test_a_ball_is_one_piece_with_a_manifold_surface(seed):
-    """Noise or not: one piece, the Euler number of a ball and of its surface, and most of its volume."""
+def test_a_ball_is_one_component_with_a_manifold_surface(seed):
+    """Noise or not: one component, the Euler number of a ball and of its surface, and most of its volume."""
     mesh, image, counts = ball(seed=seed)
     result = solved(mesh.points, mesh.cells, None, counts=counts)
     inside = mesh.cells[result.labels == 1]
-    assert result.pieces.tolist() == [1, 1]
+    assert result.components.tolist() == [1, 1]
     assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
     assert naive.euler(naive.faces_of(inside)) == 1
     assert volumes(mesh.points, inside).sum() == pytest.approx(image.data.sum(), rel=0.12)
@@ -196,41 +196,43 @@ def test_a_disc_in_the_plane():
     loose = np.random.default_rng(2).random(len(counts)) < 0.05
     counts[loose] = counts[loose][:, ::-1]
     result = solved(mesh.points, mesh.cells, None, counts=csr_array(counts))
-    assert result.pieces.tolist() == [1, 1]
+    assert result.components.tolist() == [1, 1]
     assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
     assert naive.nonmanifold(mesh.cells, result.labels) == {}
     assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() == pytest.approx(image.data.sum(), rel=0.1)
 
 
 def two_balls(gap):
-    """A lattice with a large ball and a small one, each cell full of one label but for a share `gap` along a line."""
+    """A lattice with a large and a small ball, each cell full of one label but for a fraction `gap` along a line."""
     mesh, image, counts = ball(radius=5.0)
     centre, full = mesh.points[mesh.cells].mean(axis=1), counts.toarray()
     is_small = np.linalg.norm(centre - 3.0, axis=1) < 4.0
     is_between = (np.ptp(centre, axis=1) < 4.0) & (centre.mean(axis=1) < 9.0) & ~is_small
-    for chosen, share in ((is_small, 1.0), (is_between, gap)):
-        full[chosen] = full[chosen].sum(axis=1)[:, None] * [1.0 - share, share]
+    for chosen, fraction in ((is_small, 1.0), (is_between, gap)):
+        full[chosen] = full[chosen].sum(axis=1)[:, None] * [1.0 - fraction, fraction]
     return mesh, csr_array(full), is_small, (int(image.data.sum()), int(full[is_small, 1].sum()))
 
 
-def test_fragments_go_and_pieces_stay():
-    """Two balls are two pieces where voxels have two; the smaller goes where they have one, or only a speck besides."""
+def test_fragments_go_and_components_stay():
+    """Two balls are two components where voxels have two; the smaller goes where they have one, or a speck besides."""
     mesh, counts, is_small, (large, small) = two_balls(0.0)
     ends = {}
     for name, sizes in (("two", [large, small]), ("one", [large]), ("speck", [large, small // 4])):
-        ends[name] = solved(mesh.points, mesh.cells, None, counts=counts, pieces=[np.array([9000]), np.array(sizes)])
-    assert ends["two"].pieces.tolist() == [1, 2]
-    assert ends["one"].pieces.tolist() == ends["speck"].pieces.tolist() == [1, 1]
+        ends[name] = solved(
+            mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)]
+        )
+    assert ends["two"].components.tolist() == [1, 2]
+    assert ends["one"].components.tolist() == ends["speck"].components.tolist() == [1, 1]
     assert (ends["one"].labels[is_small] == 0).all()
     assert (ends["two"].labels[is_small] == 1).mean() > 0.5
 
 
 def test_what_hangs_together_in_the_voxels_is_bridged():
-    """Between the balls nearly half of the voxels have the label: they are linked, where voxels have one piece."""
+    """Between the balls nearly half of the voxels have the label: they are linked, where voxels have one component."""
     mesh, counts, is_small, (large, small) = two_balls(0.45)
     for sizes, n_pieces in (([large, small], 2), ([large + small], 1)):
-        result = solved(mesh.points, mesh.cells, None, counts=counts, pieces=[np.array([9000]), np.array(sizes)])
-        assert result.pieces.tolist() == [1, n_pieces]
+        result = solved(mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)])
+        assert result.components.tolist() == [1, n_pieces]
         assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
         assert (result.labels[is_small] == 1).mean() > 0.5
 
@@ -243,7 +245,7 @@ def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
     for other in ((2, 2, 1), (2, 2, 2)):
         labels = ((cube == 1).all(axis=1) | (cube == other).all(axis=1)).astype(np.int64)
         assert len(naive.nonmanifold(mesh.cells, labels)) > 0
-        result = solved(mesh.points, mesh.cells, labels, pieces=[np.array([60]), np.array([1, 1])], weight=1e-6)
+        result = solved(mesh.points, mesh.cells, labels, components=[np.array([60]), np.array([1, 1])], weight=1e-6)
         assert naive.nonmanifold(mesh.cells, result.labels) == {}
         assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
         assert 0 < result.n_moved < 10
@@ -265,12 +267,12 @@ def test_no_label_goes_for_a_bridge():
     points = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.5], [3.0, 1.5], [4.0, 0.0]])
     cells = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
     counts = csr_array([[1.0, 0.0], [0.08, 0.1], [1.0, 0.0]])
-    result = solved(points, cells, None, counts=counts, pieces=[np.array([2])] * 2, weight=1e-9)
+    result = solved(points, cells, None, counts=counts, components=[np.array([2])] * 2, weight=1e-9)
     assert result.labels.tolist() == [0, 1, 1]
     assert len(result.lost) == 0
 
 
-def test_pieces_of_voxels():
+def test_components_of_voxels():
     partition = np.array([[0, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 3]])
-    sizes = voxel_pieces(partition, 4)
+    sizes = voxel_components(partition, 4)
     assert [s.tolist() for s in sizes] == [[5], [3, 3], [], [1]]

@@ -9,12 +9,12 @@ from naive import circumcentres
 from scipy.spatial import Delaunay
 
 import tetopt
-from tetopt.energy.geometric import E_G_gradient, ring_volumes
+from tetopt.energy.geometric import E_G_gradient, star_volumes
 from tetopt.energy.sampling import sampling_grid, to_ticks
 from tetopt.engine.loop import frozen_axes
 from tetopt.engine.paper import default_n_t, optimize_paper
 from tetopt.geometry.simplex import oriented, rho, volumes
-from tetopt.geometry.topology import boundary_facets, facets, rings
+from tetopt.geometry.topology import boundary_facets, facets, stars
 from tetopt.start.delaunay import delaunay
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
@@ -57,7 +57,7 @@ def domain_problems(image, mesh):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("k_D", [0.0, 0.3])
 @pytest.mark.parametrize("retessellate", ["first", "accept", "never"])
-def test_laws(name, k_D, retessellate):
+def test_mappings(name, k_D, retessellate):
     """Every iteration holds every voxel; E never rises on a fixed connectivity, nor at all with "accept"."""
     image, blocks = CASES[name]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
@@ -120,16 +120,16 @@ def test_lloyd_reaches_a_stationary_mesh(name):
 
 
 def test_lloyd_moves_to_the_weighted_circumcentre():
-    """One interior node: the volume-weighted mean of its ring's circumcentres, in one step (Section 2.1)."""
+    """One interior node: the volume-weighted mean of its star's circumcentres, in one step (Section 2.1)."""
     image = tetopt.Image(np.zeros((8, 8, 8)) + np.arange(8))
     corner = np.array(np.meshgrid([-0.5, 7.5], [-0.5, 7.5], [-0.5, 7.5])).reshape(3, -1).T
     points = np.vstack([corner, [2.0, 3.1, 4.7]])
     cells = Delaunay(points).simplices
     cells = oriented(points, cells[np.abs(volumes(points, cells)) > 1e-9])
-    ring = cells[rings(cells, 9).cells[rings(cells, 9).start[8] :]]
-    v = volumes(points, ring)
-    expected = (v[:, None] * circumcentres(points, ring)).sum(0) / v.sum()
-    assert v.sum() == pytest.approx(ring_volumes(points, cells)[8])
+    star = cells[stars(cells, 9).cells[stars(cells, 9).start[8] :]]
+    v = volumes(points, star)
+    expected = (v[:, None] * circumcentres(points, star)).sum(0) / v.sum()
+    assert v.sum() == pytest.approx(star_volumes(points, cells)[8])
     result = optimize_paper(
         image, tetopt.Mesh(points, cells), k_D=0.0, iterations=1, retessellate="never", boundary="fixed"
     )

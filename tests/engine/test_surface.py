@@ -28,13 +28,13 @@ def times_covered(image, mesh):
     return total, int((cell_of_voxel(image, mesh) >= 0).sum())
 
 
-def check(image, mask, mesh, floor=12.0, is_between=None):
+def check(image, mask, mesh, min_dihedral=12.0, is_between=None):
     """The mesh fills the mask; nodes `is_between` (N,) labels may be a tenth of a voxel off its surface."""
     assert tetopt.check_mesh(mesh, is_whole=False) == []
     total, covered = times_covered(image, mesh)
     assert total == covered  # no voxel in two cells
     if mesh.ndim == 3:
-        assert tetopt.quality(mesh.points, mesh.cells).min_dihedral >= floor - 1e-9
+        assert tetopt.quality(mesh.points, mesh.cells).min_dihedral >= min_dihedral - 1e-9
     # Boundary nodes lie on the box's faces or on the surface.
     index = image.to_index(mesh.points)
     outer = np.unique(boundary_facets(mesh.cells))
@@ -138,13 +138,13 @@ def test_same_bits_on_any_number_of_threads():
 
 
 def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
-    """The floor is missed then; the mesh is the one before the lift."""
+    """Cells stay flat then; the mesh is the one before the lift."""
     image, mask = shaped("handle")
     target = content(image, mask=mask)
     start = lattice_within(target.image, target.region, nodes=150)
     lifted = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
     monkeypatch.setattr(Run, "_overlapping", lambda self, state: np.ones(100, dtype=bool))
-    monkeypatch.setattr(Run, "mend_surfaces", lambda self, carves, floor: 0)
+    monkeypatch.setattr(Run, "mend_surfaces", lambda self, carves, min_dihedral: 0)
     kept = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
     angles = [tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)]
     assert angles[1] < angles[0]
@@ -244,15 +244,15 @@ def test_labels_and_an_image_share_the_cells():
     at = grid(shape)
     image = tetopt.Image(100.0 * (at[..., 0] > 12.3))
     labels = tetopt.Image(1.0 * (at[..., 1] > 9.4))
-    share = {}
+    fraction = {}
     for weight in (None, 1.0):
         target = content(image) if weight is None else content(image, labels, label_weight=weight)
         mesh = tetopt.mesh_image(target, 300).mesh
         dice = min(row.dice for row in label_fidelity(labels, mesh))
-        share[weight] = dice, tetopt.E_D(image, mesh) / (np.var(image.data) * image.volume)
-    assert share[None][0] < 0.98
-    assert share[1.0][0] > 0.99
-    assert share[1.0][1] < 0.02
+        fraction[weight] = dice, tetopt.E_D(image, mesh) / (np.var(image.data) * image.volume)
+    assert fraction[None][0] < 0.98
+    assert fraction[1.0][0] > 0.99
+    assert fraction[1.0][1] < 0.02
 
 
 def test_contrasts_of_different_scales_are_all_seen():
@@ -287,8 +287,8 @@ def test_an_error_wanted_within_a_mask():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     result = tetopt.mesh_image(target, target_error=0.2, iterations=6)
-    share = result.history[-1].E_D / (target.variance * target.volume)
-    assert 0.1 < share <= 0.2
+    fraction = result.history[-1].E_D / (target.variance * target.volume)
+    assert 0.1 < fraction <= 0.2
     more = tetopt.mesh_image(target, target_error=0.1, iterations=6)
     assert len(more.mesh.points) > len(result.mesh.points)
 

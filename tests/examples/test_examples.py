@@ -30,7 +30,7 @@ class Number(NamedTuple):
 
 
 NUMBERS = {
-    "first_mesh": Number("share", ".5f", "0.00064"),
+    "first_mesh": Number("fraction", ".5f", "0.00064"),
     "ventricles": Number("volume_ml", ".2f", "16.96"),
     "organ_from_mask": Number("dice", ".4f", "0.9946"),
     "tissues_from_labels": Number("white_dice", ".4f", "0.8130"),

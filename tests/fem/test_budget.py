@@ -41,7 +41,7 @@ def test_memory_sets_the_size(monkeypatch):
     monkeypatch.setattr(budget, "available_bytes", lambda: 5_000_000)
     dofs, is_short = affordable_dofs(image, (0.3,), 10.0)
     assert is_short
-    assert dofs == int(budget.FREE_SHARE * 5_000_000 / budget.DOF_BYTES)
+    assert dofs == int(budget.FREE_FRACTION * 5_000_000 / budget.DOF_BYTES)
 
 
 def test_small_images_are_taken_whole():

@@ -43,8 +43,8 @@ def block(sides, blocks, kind=None):
     return image, lattice_mesh(image, kind, blocks=blocks)
 
 
-def distorted(mesh, rng, share=0.2):
-    """The mesh with its inner nodes shifted by a share of the shortest edge."""
+def distorted(mesh, rng, fraction=0.2):
+    """The mesh with its inner nodes shifted by a fraction of the shortest edge."""
     points = mesh.points.copy()
     inner = np.setdiff1d(np.arange(len(points)), boundary_facets(mesh.cells))
     corners = points[mesh.cells]
@@ -52,7 +52,7 @@ def distorted(mesh, rng, share=0.2):
         np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min() for a, b in combinations(range(corners.shape[1]), 2)
     )
     step = rng.normal(size=(len(inner), mesh.ndim))
-    points[inner] += share * shortest * step / np.linalg.norm(step, axis=1, keepdims=True)
+    points[inner] += fraction * shortest * step / np.linalg.norm(step, axis=1, keepdims=True)
     return Mesh(points, mesh.cells)
 
 
@@ -497,7 +497,7 @@ def test_auto_takes_multigrid_for_large_meshes(monkeypatch):
 @pytest.mark.parametrize("method", ["direct", "amg"])
 def test_an_unsolved_system_is_an_error(method, monkeypatch):
     image, mesh = block((2.0, 1.0, 3.0), (3, 3, 3))
-    monkeypatch.setattr(elasticity, "RESIDUAL_SHARE", 1e-30)
+    monkeypatch.setattr(elasticity, "RESIDUAL_FRACTION", 1e-30)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(RuntimeError, match=r"^elasticity: not solved, the residual is .* mN where .* may be$"):
@@ -705,7 +705,7 @@ def test_messages_of_meshes_that_are_not_held():
         message_of(
             lambda: compression(pieces, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
         )
-        == "mesh: 2 pieces have no node that is held, pushed or on a spring, the first has 2 cells around cell 2 "
+        == "mesh: 2 components have no node that is held, pushed or on a spring, the first has 2 cells around cell 2 "
         "(node 4); hold it or take it out"
     )
     unused = Mesh(points, PLATE.cells)

@@ -166,7 +166,7 @@ def test_near_interface_by_brute_force():
 
 
 def test_averaged_keeps_box_and_mean():
-    """Cut voxels count by their share; a linear image stays linear; the box stays the same."""
+    """Cut voxels count by the part of them; a linear image stays linear; the box stays the same."""
     rng = np.random.default_rng(1)
     image = tetopt.Image(rng.normal(size=(7, 10, 9)), affine_of(SHEARED, 2.0))
     coarse = averaged(image, (3, 10, 4))

@@ -115,8 +115,8 @@ def skfem_solution(model, step=1):
             )
             f += weight.assemble(basis, density=fields["density"])
         else:
-            share = skfem.LinearForm(lambda v, w: v[0] + v[1] + (v[2] if n == 3 else 0.0)).assemble(on_set)
-            K.setdiag(K.diagonal() + load.numbers[0] * share)
+            fraction = skfem.LinearForm(lambda v, w: v[0] + v[1] + (v[2] if n == 3 else 0.0)).assemble(on_set)
+            K.setdiag(K.diagonal() + load.numbers[0] * fraction)
     u = skfem.solve(
         *skfem.condense(K.tocsr(), f, x=prescribed, D=np.unique(np.concatenate(dofs or [np.empty(0, int)])))
     )
@@ -239,16 +239,16 @@ def test_a_stiff_block_on_a_bed_of_springs(n, order):
     bed = words_of(["hold:inferior"], n)[0][5:]
     np.testing.assert_allclose(solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8)
     low = nodes_of_order(mesh, order)[:, -1] < 1e-9
-    sunk = np.average(solution.u[low, -1], weights=spring_shares(mesh, sets, bed, order)[low])
+    sunk = np.average(solution.u[low, -1], weights=spring_fractions(mesh, sets, bed, order)[low])
     assert sunk == pytest.approx(-0.25, rel=1e-4)
     assert solution.spring_energy > 0.999 * solution.work
 
 
-def spring_shares(mesh, sets, name, order):
-    shares = np.zeros(len(nodes_of_order(mesh, order)))
+def spring_fractions(mesh, sets, name, order):
+    fractions = np.zeros(len(nodes_of_order(mesh, order)))
     chosen, weights = facet_weights(mesh, sets.facets[name], order)
-    np.add.at(shares, chosen, weights)
-    return shares
+    np.add.at(fractions, chosen, weights)
+    return fractions
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -439,7 +439,8 @@ def test_any_number_of_free_pieces_on_springs():
         solve(model._replace(loads=(model.loads[0], model.loads[2])))
     n_cells = len(mesh.cells)
     assert str(error.value) == (
-        f"mesh: 1 pieces have no node that is held, pushed or on a spring, the first has {n_cells} cells around cell "
+        f"mesh: 1 components have no node that is held, pushed or on a spring, the first has {n_cells} cells around "
+        f"cell "
         f"{n_cells} (node {pair.cells[n_cells, 0]}); hold it or take it out"
     )
 

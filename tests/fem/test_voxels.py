@@ -147,11 +147,11 @@ def test_steps_of_the_iteration():
     direction = z + 0.7 * p
     voxel_kernels.turn(p, z, 0.7)
     np.testing.assert_allclose(p, direction, rtol=1e-13)
-    d, y, f, share = (rng.normal(size=z.shape).astype(np.float32) for _ in range(4))
+    d, y, f, weight = (rng.normal(size=z.shape).astype(np.float32) for _ in range(4))
     scale = np.array([1.0, 2.0, 3.0], dtype=np.float32)
-    step = 0.2 * d + 2.4 * share[0] * scale[:, None, None, None] * f
+    step = 0.2 * d + 2.4 * weight[0] * scale[:, None, None, None] * f
     after = y + step
-    voxel_kernels.smooth(d, y, f, share[0], scale, (0.2, 2.4))
+    voxel_kernels.smooth(d, y, f, weight[0], scale, (0.2, 2.4))
     np.testing.assert_allclose(d, step, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(y, after, rtol=1e-4, atol=1e-6)
 
@@ -230,7 +230,7 @@ def test_patch(shape, linear):
 
 @kernel
 @pytest.mark.parametrize("shape", [(7, 10, 9), (5, 1, 6)])
-def test_block_means_against_exact_shares(shape):
+def test_block_means_against_exact_fractions(shape):
     data = np.random.default_rng(6).normal(size=shape)
     for new in (tuple((s + 1) // 2 for s in shape), tuple(max(1, s - 2) for s in shape), shape):
         np.testing.assert_allclose(block_means(data, new), naive.block_means(data, new), atol=1e-13)

@@ -11,9 +11,9 @@ def test_sides_of_a_box():
     assert box_sides((4, 7, 1)).tolist() == [[-0.5, 3.5], [-0.5, 6.5], [-0.5, 0.5]]
 
 
-@pytest.mark.parametrize(("share", "is_on"), [(0.0, True), (0.9, True), (1.1, False)])
-def test_a_place_is_on_a_side_up_to_the_tolerance(share, is_on):
-    off = share * ON_SIDE_VOXELS
+@pytest.mark.parametrize(("fraction", "is_on"), [(0.0, True), (0.9, True), (1.1, False)])
+def test_a_place_is_on_a_side_up_to_the_tolerance(fraction, is_on):
+    off = fraction * ON_SIDE_VOXELS
     places = np.array([[-0.5 - off, 1.0], [3.5 + off, 6.5 - off]])
     expected = [[[is_on, False], [False, False]], [[False, is_on], [False, is_on]]]
     assert is_on_sides(places, box_sides((4, 7))).tolist() == expected

@@ -64,10 +64,10 @@ def test_two_cavities_that_touch_in_a_node_are_joined():
     assert len(holed.cells) - len(star) < len(left.cells) < len(holed.cells)
 
 
-@given(seed=st.integers(0, 10_000), share=st.floats(0.3, 0.97), n=st.sampled_from([2, 3]))
-def test_what_is_left_of_any_part_is_a_manifold(seed, share, n):
+@given(seed=st.integers(0, 10_000), fraction=st.floats(0.3, 0.97), n=st.sampled_from([2, 3]))
+def test_what_is_left_of_any_part_is_a_manifold(seed, fraction, n):
     mesh = box(n)
-    is_in = np.random.default_rng(seed).random(len(mesh.cells)) < share
+    is_in = np.random.default_rng(seed).random(len(mesh.cells)) < fraction
     is_in[0] = True
     chosen = part(mesh, is_in)
     is_kept = kept_of(chosen)

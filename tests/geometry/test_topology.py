@@ -1,4 +1,4 @@
-"""Facets, rings, colours and components, against their twins and against the divergence theorem."""
+"""Facets, stars, colours and components, against their twins and against the divergence theorem."""
 
 import naive
 import numpy as np
@@ -16,7 +16,7 @@ from tetopt.geometry.topology import (
     folded,
     greedy_colours,
     largest_component,
-    rings,
+    stars,
 )
 
 pytestmark = pytest.mark.kernel
@@ -34,25 +34,25 @@ def random_mesh(seed, n):
     return points[order], rng.permutation(place[cells])
 
 
-# Rings
+# Stars
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
-def test_rings_of_small_meshes(mesh):
+def test_stars_of_small_meshes(mesh):
     points, cells = mesh
-    around = rings(cells, len(points))
-    assert [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)] == naive.rings(
+    around = stars(cells, len(points))
+    assert [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)] == naive.stars(
         cells, len(points)
     )
 
 
 @given(seeds, dimensions)
-def test_rings_are_those_of_the_twin(seed, n):
+def test_stars_are_those_of_the_twin(seed, n):
     points, cells = random_mesh(seed, n)
-    around = rings(cells, len(points) + 2)  # the last two nodes are in no cell
+    around = stars(cells, len(points) + 2)  # the last two nodes are in no cell
     assert len(around.start) == len(points) + 3
     listed = [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)]
-    assert listed == naive.rings(cells, len(points) + 2)
+    assert listed == naive.stars(cells, len(points) + 2)
     assert listed[-2:] == [[], []]
 
 
@@ -178,7 +178,7 @@ def test_the_boundary_has_no_boundary(seed):
 
 
 def colours_of(cells, n_nodes):
-    around = rings(cells, n_nodes)
+    around = stars(cells, n_nodes)
     return greedy_colours(np.ascontiguousarray(cells), around.start, around.cells)
 
 
@@ -201,11 +201,11 @@ def test_colours_are_proper_and_those_of_the_twin(seed, n):
     assert colours.tolist() == naive.node_colours(cells, len(points))
     of_cells = np.sort(colours[cells], axis=1)
     assert (np.diff(of_cells, axis=1) > 0).all()
-    neighbours = max(len({a for c in ring for a in cells[c].tolist()}) for ring in naive.rings(cells, len(points)))
+    neighbours = max(len({a for c in star for a in cells[c].tolist()}) for star in naive.stars(cells, len(points)))
     assert colours.max() < neighbours
-    # Nodes of one colour have rings without a common cell.
+    # Nodes of one colour have stars without a common cell.
     for colour in range(colours.max() + 1):
-        touched = [cell for node in np.flatnonzero(colours == colour) for cell in naive.rings(cells, len(points))[node]]
+        touched = [cell for node in np.flatnonzero(colours == colour) for cell in naive.stars(cells, len(points))[node]]
         assert len(touched) == len(set(touched))
 
 
@@ -263,7 +263,7 @@ def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_folded(n):
-    """A conforming mesh has no fold; a node pulled through its ring makes one; a third cell at a facet is one."""
+    """A conforming mesh has no fold; a node pulled through its star makes one; a third cell at a facet is one."""
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
     assert folded(mesh.cells).shape == (0, 2)
     first = mesh.cells[0]

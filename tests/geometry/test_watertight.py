@@ -11,7 +11,7 @@ from shapes import n_pieces, volume_and_area
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import facet_areas, oriented, volumes
-from tetopt.geometry.surface import SHIFT_SHARE, extract_surface
+from tetopt.geometry.surface import SHIFT_FRACTION, extract_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.start.lattice import lattice_mesh
@@ -163,7 +163,7 @@ def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
     assert (len(surface.points), len(surface.triangles)) == (8, 8)
     assert (surface.n_parted, n_pieces(surface)) == (len(shared), 2)
     heights = 3.0 * volumes(points, cells) / facet_areas(points, cells).max(axis=1)
-    assert surface.largest_shift == pytest.approx(SHIFT_SHARE * heights[chosen].min())
+    assert surface.largest_shift == pytest.approx(SHIFT_FRACTION * heights[chosen].min())
     for node in shared:  # one copy keeps its place
         away = np.sort(np.linalg.norm(surface.points - points[node], axis=1))
         np.testing.assert_allclose(away[:2], [0.0, surface.largest_shift], atol=1e-15)
@@ -254,9 +254,9 @@ def test_the_shift_is_felt_in_float32_and_turns_no_cell():
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["five-tet", "bcc"]), st.sampled_from([0.1, 0.5, 0.9]))
-def test_any_cells_of_a_lattice(seed, kind, share):
+def test_any_cells_of_a_lattice(seed, kind, fraction):
     points, cells = grid((3, 3, 2), kind, noise=0.05, seed=seed)
-    is_chosen = np.random.default_rng(seed).random(len(cells)) < share
+    is_chosen = np.random.default_rng(seed).random(len(cells)) < fraction
     is_chosen[0] = True
     surface = extract_surface(points, cells, is_chosen)
     assert_surface_of(surface, points, cells[is_chosen])
@@ -265,12 +265,12 @@ def test_any_cells_of_a_lattice(seed, kind, share):
 
 
 @pytest.mark.parametrize("kind", ["five-tet", "bcc"])
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
+@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.9])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_parted_sheets_do_not_cross(kind, share, seed):
+def test_parted_sheets_do_not_cross(kind, fraction, seed):
     """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
     points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)
-    surface = extract_surface(points, cells, np.random.default_rng(seed).random(len(cells)) < share)
+    surface = extract_surface(points, cells, np.random.default_rng(seed).random(len(cells)) < fraction)
     assert surface.n_parted > 8
     assert n_crossings(surface) == 0
 

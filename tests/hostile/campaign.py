@@ -32,8 +32,8 @@ MOST_MEMORY = 3 << 30  # bytes of address space that a command may take beyond t
 LARGEST_FILE = 1 << 28  # bytes that it may write
 MOST_CPU_SECONDS = 10
 MOST_SECONDS = 120  # on a busy machine
-IDLE_SECONDS = 10  # after which a child that has used no more than this share of them waits for ever
-IDLE_SHARE = 0.04
+IDLE_SECONDS = 10  # after which a child that has used no more than this fraction of them waits for ever
+IDLE_FRACTION = 0.04
 POLL_SECONDS = 0.002
 
 
@@ -130,7 +130,7 @@ def _is_hanging(child: int, seconds: float) -> bool:
         with contextlib.suppress(OSError):  # it may end just now
             fields = path.read_text().rpartition(")")[2].split()
             ticks += sum(map(int, fields[11:15])) if int(fields[3]) == child else 0
-    return ticks / os.sysconf("SC_CLK_TCK") < IDLE_SHARE * seconds or seconds > MOST_SECONDS
+    return ticks / os.sysconf("SC_CLK_TCK") < IDLE_FRACTION * seconds or seconds > MOST_SECONDS
 
 
 class ForkedReader:

@@ -351,11 +351,11 @@ def phantoms(draw):
     return what, ("phantom", name, "-o", "ph.nii.gz", "--labels", "l.nii.gz"), ("ph.nii.gz", "l.nii.gz")
 
 
-def laws(draw):
-    """Laws in TOML and CSV."""
-    name = draw.one("law.toml", "law.csv", "byname.csv")
+def mappings(draw):
+    """Mappings in TOML and CSV."""
+    name = draw.one("mapping.toml", "mapping.csv", "byname.csv")
     name, what = draw.bad(
-        name, (m.toml,) * 4 + m.TEXT + m.ANY if name == "law.toml" else (m.table,) * 4 + m.TEXT + m.ANY
+        name, (m.toml,) * 4 + m.TEXT + m.ANY if name == "mapping.toml" else (m.table,) * 4 + m.TEXT + m.ANY
     )
     option = draw.one("--young", "--young", "--nu", "--density")
     more = ("--young", "3") if option != "--young" else draw.one(("--nu", name), ())
@@ -551,7 +551,7 @@ def special_files(draw):
 
 # Command lines
 
-WHOLE, REAL, LAW, WORD = "whole", "real", "law", "word"
+WHOLE, REAL, MAPPING, WORD = "whole", "real", "mapping", "word"
 FORMULAS = (
     "=1+1", "__import__('os').system('touch PWNED')", "9**9**9", "9**9**9**9*h", "h**1e300",
     "(" * 500 + "h" + ")" * 500, "-" * 3000 + "h",
@@ -563,7 +563,7 @@ FORMULAS = (
     "", " ", "\x1b[31m", "<script>hostile()</script>",
     "0:1,100:5", "100:1,0:5", "0:1,0:2", "0:1,inf:2", "nan:1,1:2", "0:-1", "0", ":", ",", "1=", "=1", "1=1=1",
     "1=2,1=3", "*=1,*=2", "1.5=2", "-1=2", "liver=2",
-    "1=2,*=5", "nowhere.toml", "law.csv", "../outside.csv", "/etc/passwd.csv", "1e-320", "-5", "nan", "inf", "h",
+    "1=2,*=5", "nowhere.toml", "mapping.csv", "../outside.csv", "/etc/passwd.csv", "1e-320", "-5", "nan", "inf", "h",
     "-h", "0*h", "1e300*h", "sqrt(h-1e9)", "h**0.5",
 )  # fmt: skip
 WORDS = (
@@ -585,12 +585,13 @@ WORDS = (
     "1,1", "left-lung,liver", "liver,nowhere",
 )  # fmt: skip
 SOLVER_OPTIONS = {
-    "--young": LAW, "--nu": LAW, "--density": LAW, "--average": WORD, "--bins": WORD, "--set": WORD, "--sets": WORD,
+    "--young": MAPPING, "--nu": MAPPING, "--density": MAPPING, "--average": WORD, "--bins": WORD, "--set": WORD,
+    "--sets": WORD,
     "--load": WORD, "--order": WHOLE,
 }  # fmt: skip
 OPTIONS = {
     "mesh": {
-        "--nodes": WHOLE, "--target-error": REAL, "--size-min": REAL, "--size-max": REAL, "--edge-max": REAL,
+        "--nodes": WHOLE, "--target-error": REAL, "--size-min": REAL, "--edge-size": REAL, "--edge-max": REAL,
         "--gradation": REAL, "--lattice": WORD, "--spacing": REAL,
         "--k-d": REAL, "--boundary": WORD, "--method": WORD, "--shape-power": REAL, "--min-dihedral": REAL,
         "--n-t": WHOLE, "--retessellate": WORD, "--threads": WHOLE,
@@ -610,7 +611,8 @@ OPTIONS = {
 
 # What is taken where the rest of the line is sound: not everything should be refused at its first word.
 PLAUSIBLE = {
-    "--nodes": ("9", "30", "80"), "--target-error": ("0.5", "0.9"), "--size-min": ("1", "5"), "--size-max": ("6", "12"),
+    "--nodes": ("9", "30", "80"), "--target-error": ("0.5", "0.9"), "--size-min": ("1", "5"),
+    "--edge-size": ("6", "12"),
     "--edge-max": ("9", "20"), "--gradation": ("0.3", "1"), "--lattice": ("bcc", "five-tet", "octree"),
     "--spacing": ("6", "9"),
     "--k-d": ("0", "0.5", "0.99"), "--boundary": ("slide", "fixed"), "--method": ("paper", "fast"),
@@ -632,7 +634,7 @@ PLAUSIBLE = {
 
 
 def options(draw):
-    """Numbers, words, formulas and laws on the command line."""
+    """Numbers, words, formulas and mappings on the command line."""
     command = draw.one(
         *["mesh"] * 5, *["convert"] * 2, "fem", "fem", "surface", "segment", "phantom", "quality", "view"
     )
@@ -654,11 +656,11 @@ def options(draw):
         base += ("--labels", draw.good("labels.nii"), "--label-names", draw.good("lut.txt"))
     elif command == "mesh" and draw.rng.random() < 0.3:
         base += ("--mask", draw.good("mask.nii"))
-    draw.good("law.csv")
+    draw.good("mapping.csv")
     added: list[str] = []
     for _ in range(int(draw.rng.choice([1, 1, 2, 3]))):
         name = one_of(draw.rng, sorted(OPTIONS[command]))
-        pool = {WHOLE: HOSTILE_NUMBERS, REAL: HOSTILE_NUMBERS, LAW: FORMULAS, WORD: WORDS}[OPTIONS[command][name]]
+        pool = {WHOLE: HOSTILE_NUMBERS, REAL: HOSTILE_NUMBERS, MAPPING: FORMULAS, WORD: WORDS}[OPTIONS[command][name]]
         value = one_of(draw.rng, PLAUSIBLE[name] if name in PLAUSIBLE and draw.rng.random() < 0.4 else pool)
         value = one_of(draw.rng, HOSTILE_NAMES) if draw.rng.random() < 0.1 else value
         value = value.replace("\ud800", "\udcff").replace("\0", "") if draw.rng.random() < 0.9 else value
@@ -712,7 +714,7 @@ KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),
-    "laws in files": (3, laws),
+    "mappings in files": (3, mappings),
     "options": (9, options), "command lines": (2, lines), "file names": (4, names), "bombs": (2, bombs),
     "outside": (1, outside),
     "special files": (2, special_files),

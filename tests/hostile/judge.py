@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 from hostile.cases import Case
 
-GOOD = ("done", "refused", "promise missed")
+GOOD = ("done", "refused", "requirement violated")
 BAD = (
     "traceback", "signal", "hang", "memory", "invalid output", "half-written", "stray file", "let in",
     "refused badly", "wrong exit code",
@@ -139,7 +139,7 @@ def _of_words(case: Case, ending: Ending) -> tuple[str, str]:
             else ("refused badly", f"exit {ending.code} without a line: {_last(ending)[:100]!r}")
         )
     if ending.code == 1:
-        return "promise missed", mistakes[0][:120]
+        return "requirement violated", mistakes[0][:120]
     if len(mistakes) > 1:
         return "refused badly", f"{len(mistakes)} lines: {mistakes[0][:80]} / {mistakes[1][:80]}"
     if (

@@ -70,7 +70,7 @@ def spin() -> int:
 DEEDS = {
     "done": (write, "done"),
     "refused": (refuse, "refused"),
-    "promise missed": (lambda: write() or say("tetopt: out.vtk: 3 cells are flat") or 1, "promise missed"),
+    "requirement violated": (lambda: write() or say("tetopt: out.vtk: 3 cells are flat") or 1, "requirement violated"),
     "exception": (lambda: 1 // 0, "traceback"),
     "deep recursion": (lambda: json.loads("[" * 100_000), "traceback"),
     "segmentation fault": (lambda: os.kill(os.getpid(), signal.SIGSEGV), "signal"),

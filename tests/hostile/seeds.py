@@ -55,9 +55,10 @@ TABLES = {
     "dseg.tsv": b"index\tname\tcolor\n1\tleft lung\t#ff0000\n2\tliver\t#00ff00\n",
     "slicer.csv": b"LabelValue,Name,Color_R,Color_G,Color_B,Color_A\n1,lung,10,20,30,255\n2,liver,40,50,60,255\n",
 }
-LAWS = {
-    "law.toml": b'label = ["0", "1", "*"]\nyoung = [1.0, 2.5, 9]\nnu = [0.3, 0.4, 0.45]\ndensity = [1000, 1100, 900]\n',
-    "law.csv": b"intensity,young,nu\n0,1.0,0.3\n50,2.0,0.35\n100,5.5,0.4\n",
+MAPPINGS = {
+    "mapping.toml": b'label = ["0", "1", "*"]\n'
+    b"young = [1.0, 2.5, 9]\nnu = [0.3, 0.4, 0.45]\ndensity = [1000, 1100, 900]\n",
+    "mapping.csv": b"intensity,young,nu\n0,1.0,0.3\n50,2.0,0.35\n100,5.5,0.4\n",
     "byname.csv": b"name,young,nu\nleft lung,1.0,0.3\nliver,2.0,0.35\n*,5.5,0.4\n",
 }
 
@@ -88,7 +89,7 @@ def write_seeds(folder: Path):
     _write_zarr(folder, data, place)
     for name in ("p.png", "p.tif", "p.bmp", "p.jpg"):
         PIL.Image.fromarray(data[:, :, 5].astype(np.uint8)).save(folder / name)
-    for name, content in ({"phantom.toml": PHANTOM} | TABLES | LAWS).items():
+    for name, content in ({"phantom.toml": PHANTOM} | TABLES | MAPPINGS).items():
         (folder / name).write_bytes(content)
     with contextlib.chdir(folder):
         _write_meshes()

@@ -347,8 +347,8 @@ def test_curved_edges_are_made_straight_and_told(tmp_path, n):
     edges = np.unique(ends, axis=0)
     length = np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1)
     first = len(mesh.points)
-    for number, share in ((3, 0.99e-6), (5, 1.01e-6), (7, 0.25)):
-        grid.points[place[first + number], 0] += share * length[number]
+    for number, fraction in ((3, 0.99e-6), (5, 1.01e-6), (7, 0.25)):
+        grid.points[place[first + number], 0] += fraction * length[number]
     grid.save(tmp_path / "a.vtu")
     back = load_mesh(tmp_path / "a.vtu")
     (note,) = back.notes
@@ -546,11 +546,11 @@ def test_garbage(tmp_path, name, raw, assert_refused):
     assert_refused(tmp_path / name, "damaged|cannot be read|UTF-8")
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
-def test_truncated(tmp_path, share, assert_refused):
+@pytest.mark.parametrize("fraction", [0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_truncated(tmp_path, fraction, assert_refused):
     save_mesh(tmp_path / "a.vtu", bent(3), cell_fields(bent(3)), ABOUT)
     whole = (tmp_path / "a.vtu").read_bytes()
-    (tmp_path / "a.vtu").write_bytes(whole[: int(len(whole) * share)])
+    (tmp_path / "a.vtu").write_bytes(whole[: int(len(whole) * fraction)])
     assert_refused(tmp_path / "a.vtu", "damaged")
 
 

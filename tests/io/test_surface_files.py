@@ -29,20 +29,20 @@ EDGE = (
 SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".STL", ".vtp", ".vtk"])
 
 
-def some_surface(seed, share=0.5):
+def some_surface(seed, fraction=0.5):
     """The surface of some cells of a lattice out where coordinates have few bits left, and the cells' volume."""
     mesh = lattice_mesh(Image(np.zeros((7, 8, 9)), np.diag([1.1, 0.9, 1.3, 1.0])), nodes=100)
     rng = np.random.default_rng(seed)
     points = mesh.points + rng.normal(0.0, 0.05, mesh.points.shape) + rng.uniform(-400.0, 400.0, 3)
-    chosen = np.append(np.flatnonzero(rng.random(len(mesh.cells)) < share), 0)
+    chosen = np.append(np.flatnonzero(rng.random(len(mesh.cells)) < fraction), 0)
     return extract_surface(points, mesh.cells, chosen), volumes(points, mesh.cells[np.unique(chosen)]).sum()
 
 
 @SUFFIXES
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.05, 0.3, 0.6, 0.9]))
-def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, share):
-    surface, expected = some_surface(seed, share)
+@given(seed=st.integers(0, 2**32 - 1), fraction=st.sampled_from([0.05, 0.3, 0.6, 0.9]))
+def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, fraction):
+    surface, expected = some_surface(seed, fraction)
     save_surface(tmp_path / f"a{suffix}", surface)
     check = checked_surface(tmp_path / f"a{suffix}")
     volume, area = volume_and_area(surface)

@@ -94,7 +94,7 @@ def write_pieces(path, pieces):
                 into[name] = np.concatenate([piece[column][name] for piece in pieces])
 
 
-def pieces_of(model):
+def components_of(model):
     """The cells of each part, and of each of their points the coordinates; all with data."""
     for part in np.unique(model.cell_data["part"]):
         chosen = np.flatnonzero(model.cell_data["part"] == part)
@@ -112,7 +112,7 @@ def check_whole(back, model):
 
 def test_pieces_are_joined_where_points_lie_at_one_place(tmp_path):
     model = in_parts(sample_model())
-    pieces = list(pieces_of(model))
+    pieces = list(components_of(model))
     no_cells = (np.empty((0, 3)), np.empty((0, 4), np.int64))
     nothing = (*no_cells, *({name: values[:0] for name, values in data.items()} for data in pieces[0][2:]))
     write_pieces(tmp_path / "a.vtkhdf", [nothing, *pieces, nothing])
@@ -136,7 +136,7 @@ def test_points_at_one_place_in_one_piece_stay_apart(tmp_path):
 @pytest.mark.parametrize("n_pieces", [1, 4])
 def test_ghosts_are_left_out(tmp_path, n_pieces):
     model = in_parts(sample_model())
-    own = list(pieces_of(model)) if n_pieces > 1 else [
+    own = list(components_of(model)) if n_pieces > 1 else [
         (model.mesh.points, model.mesh.cells, {"node": np.arange(len(model.mesh.points))},
          {"cell": np.arange(len(model.mesh.cells))})
     ]  # fmt: skip
@@ -152,7 +152,7 @@ def test_ghosts_are_left_out(tmp_path, n_pieces):
 
 
 def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
-    pieces = list(pieces_of(in_parts(sample_model())))
+    pieces = list(components_of(in_parts(sample_model())))
     points, cells, *data = pieces[1]
     beyond = cells.copy()
     beyond[0, 0] = len(points)
@@ -166,7 +166,7 @@ def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
         load_mesh(tmp_path / "a.vtkhdf")
 
 
-# Strangers' files
+# Untrusted files
 
 
 @pytest.fixture

@@ -52,10 +52,10 @@ def test_a_mask_that_the_mesh_does_not_show(said, change, words):
 
 
 def test_what_background_leaves_is_no_mask(said):
-    missed = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
+    violated = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
     far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
     words = "the mesh and the foreground overlap only by Dice 0.5"
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, missed=missed), far, "foreground") == [words]
+    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, violated=violated), far, "foreground") == [words]
     text = said()
     assert "mask" not in text
     assert text.count("foreground") >= text.count("\n") == 5
@@ -111,7 +111,7 @@ def test_limits_and_targets_that_edges_miss(said):
     assert "the longest edge is 28.8 mm, 20% over `edge_max` 24" in said()
     warn_of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None)
     assert "the shortest edge is 1.5 mm, 25% under `size_min` 2" in said()
-    warn_of_sizes(Sizes(largest=5.0), 1.5, 28.8, edges._replace(above=0.4))
+    warn_of_sizes(Sizes(edge_size=5.0), 1.5, 28.8, edges._replace(above=0.4))
     assert "40% of the edges are over 1.41 times their target size" in said()
 
 
@@ -133,4 +133,4 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     assert numbers["cells_without_voxel"] == n_empty > 0
     row = next(line for line in out.splitlines() if line.startswith("cells that hold no voxel centre"))
     assert row.split()[-1] == str(n_empty)
-    assert numbers["missed"] == {}
+    assert numbers["violated"] == {}

@@ -192,7 +192,7 @@ def test_distances_need_a_surface():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_points_are_spread_evenly(n):
-    """Each facet has its share of the points to within two, uniformly dense by their mean and covariance."""
+    """Each facet has its fraction of the points to within two, uniformly dense by their mean and covariance."""
     corners = np.random.default_rng(n).normal(size=(3, n, n)) + 10.0 * np.arange(3)[:, None, None]
     surface = FacetSurface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
     points = evenly_spread(surface, 3000)

@@ -91,15 +91,15 @@ def test_order_of_the_errors():
 # Histogram
 
 
-def test_histogram_is_shares_over_0_to_1_over_n():
-    share, edges = rho_histogram(*FIVE_TET_CUBE, bins=3)
+def test_histogram_is_fractions_over_0_to_1_over_n():
+    fraction, edges = rho_histogram(*FIVE_TET_CUBE, bins=3)
     assert edges == pytest.approx([0, 1 / 9, 2 / 9, 1 / 3])
-    assert share.tolist() == [0, 0, 1]
-    share, edges = rho_histogram(*FIVE_TET_CUBE, bins=30)  # rho 1/3 once, 0.2440 four times
-    assert share[29] == pytest.approx(0.2)
-    assert share[int(0.2440 * 90)] == pytest.approx(0.8)
-    share, edges = rho_histogram(*EQUILATERAL)
-    assert (share[-1], share.sum(), edges[-1], len(share), len(edges)) == (1, 1, 0.5, 40, 41)
+    assert fraction.tolist() == [0, 0, 1]
+    fraction, edges = rho_histogram(*FIVE_TET_CUBE, bins=30)  # rho 1/3 once, 0.2440 four times
+    assert fraction[29] == pytest.approx(0.2)
+    assert fraction[int(0.2440 * 90)] == pytest.approx(0.8)
+    fraction, edges = rho_histogram(*EQUILATERAL)
+    assert (fraction[-1], fraction.sum(), edges[-1], len(fraction), len(edges)) == (1, 1, 0.5, 40, 41)
 
 
 def test_histogram_counts_regular_cells_that_rounding_put_above():

@@ -1,4 +1,4 @@
-"""The modulus of a cell: the mean of the law over its voxels."""
+"""The modulus of a cell: the mean of the mapping over its voxels."""
 
 from itertools import pairwise
 
@@ -35,8 +35,8 @@ def test_the_modulus_image_keeps_its_place():
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
-def test_the_cell_s_modulus_is_the_mean_of_the_law_over_its_voxels(shape):
-    """Eq. (2). For a linear law that is the law of the mean; for a convex one it is more, where h varies."""
+def test_the_cell_s_modulus_is_the_mean_of_the_mapping_over_its_voxels(shape):
+    """Eq. (2). For a linear mapping that is the value of the mean; for a convex one it is more, where h varies."""
     image = noise(shape)
     mesh = lattice_mesh(image, blocks=(2,) * len(shape))
     moments = cell_moments(image, mesh)
@@ -98,7 +98,7 @@ def test_averages_over_ten_orders_of_magnitude(average, shape):
 
 
 def test_averages_are_in_the_order_of_their_powers():
-    """The inequality of means of powers; Hill's is between its bounds, and all are one where the law is constant."""
+    """The inequality of means of powers; Hill's is between its bounds; all are one where the mapping is constant."""
     image = noise((14, 12, 13))
     mesh = lattice_mesh(image, nodes=80)
     words = ["power:-10", "harmonic", "power:-0.5", "geometric", "power:0.5", "mean", "power:3", "power:10"]
@@ -119,9 +119,9 @@ def test_empty_space_in_a_cell():
     image = noise((10, 10, 10))
     mesh = lattice_mesh(image, nodes=40)
     owner = cell_of_voxel(image, mesh)
-    law = [(99.0, 0.0), (199.0, 10.0)]
-    assert (cell_young(image, mesh, law) > 0.0).all()
-    roots = cell_young(image, mesh, law, "power:0.5")
+    mapping = [(99.0, 0.0), (199.0, 10.0)]
+    assert (cell_young(image, mesh, mapping) > 0.0).all()
+    roots = cell_young(image, mesh, mapping, "power:0.5")
     values = np.interp(image.data[owner == 0], [99.0, 199.0], [0.0, 10.0])
     assert roots[0] == pytest.approx((values**0.5).mean() ** 2, rel=1e-12)
     assert (cell_young(image, mesh, lambda h: 0.0 * h, "power:0.5") == 0.0).all()
@@ -129,12 +129,12 @@ def test_empty_space_in_a_cell():
         with pytest.raises(
             InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*`average` mean"
         ):
-            cell_young(image, mesh, law, each)
+            cell_young(image, mesh, mapping, each)
 
 
 @pytest.mark.parametrize("average", ["mean", "geometric", "gauss", "nodes"])
-def test_a_law_need_not_be_one_for_voxels_beside_the_mesh(average):
-    """As of the air around an organ; within it everything is as with a law that holds everywhere."""
+def test_a_mapping_need_not_be_one_for_voxels_beside_the_mesh(average):
+    """As of the air around an organ; within it everything is as with a mapping that holds everywhere."""
     image = noise((12, 12, 12))
     mesh = lattice_mesh(image, nodes=200)
     inner = mesh.cells[(mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)]
@@ -215,9 +215,9 @@ def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
 def test_a_model_has_moduli_of_nodes():
     image = noise((8, 9, 10))
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
-    law = [(0.0, 1.0), (200.0, 10.0)]
-    model = build_model(mesh, image, young=law, average="nodes")
-    np.testing.assert_array_equal(model.node_young, node_young(image, mesh, law))
+    mapping = [(0.0, 1.0), (200.0, 10.0)]
+    model = build_model(mesh, image, young=mapping, average="nodes")
+    np.testing.assert_array_equal(model.node_young, node_young(image, mesh, mapping))
     np.testing.assert_array_equal(
         model.materials.young[model.materials.of_cell], gauss_young(model.node_young, mesh, 1)[:, 0]
     )
@@ -225,12 +225,12 @@ def test_a_model_has_moduli_of_nodes():
         build_model(mesh, image, young="1 + 0.045*h", average="nodes").node_young,
         node_young(image, mesh, lambda h: 1.0 + 0.045 * h),
     )
-    assert build_model(mesh, image, young=law).node_young is None
+    assert build_model(mesh, image, young=mapping).node_young is None
     assert build_model(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
     with pytest.raises(InputError, match=r"bins: moduli that vary in a cell.*another average than nodes"):
-        build_model(mesh, image, young=law, average="nodes", bins=3)
+        build_model(mesh, image, young=mapping, average="nodes", bins=3)
     with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(`image`\)"):
-        build_model(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
+        build_model(mesh, young=mapping, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
@@ -271,17 +271,17 @@ def test_a_model_has_moduli_at_gauss_points():
     """Solved as they are; its materials, for files, have the geometric means; linear cells have no others."""
     image = noise((8, 9, 10))
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
-    law = [(0.0, 1.0), (200.0, 10.0)]
-    model = build_model(mesh, image, young=law, average="gauss", order=2, loads=["compress:1%"])
-    np.testing.assert_array_equal(gauss_moduli(model), element_young(image, mesh, law, "gauss", 2))
+    mapping = [(0.0, 1.0), (200.0, 10.0)]
+    model = build_model(mesh, image, young=mapping, average="gauss", order=2, loads=["compress:1%"])
+    np.testing.assert_array_equal(gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2))
     np.testing.assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
     of_cells = model.materials.young[model.materials.of_cell]
-    np.testing.assert_array_equal(of_cells, cell_young(image, mesh, law, "geometric"))
-    assert build_model(mesh, image, young=law, average="gauss").gauss_young is None
+    np.testing.assert_array_equal(of_cells, cell_young(image, mesh, mapping, "geometric"))
+    assert build_model(mesh, image, young=mapping, average="gauss").gauss_young is None
     one = solve(model)
     other = solve(model._replace(gauss_young=None))
     assert abs(one.strain_energy / other.strain_energy - 1.0) > 1e-4
-    groups = build_model(mesh, image, young=law, average="gauss", order=2, bins=3)
+    groups = build_model(mesh, image, young=mapping, average="gauss", order=2, bins=3)
     assert (groups.gauss_young, len(groups.materials.young)) == (None, 3)
 
 

@@ -8,7 +8,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.model.averages import cell_values
 from tetopt.model.build import build_model
-from tetopt.model.laws import ByLabel
+from tetopt.model.mappings import ByLabel
 from tetopt.model.materials import binned, by_label, density_of, materials, without_moduli
 
 YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])
@@ -110,8 +110,8 @@ def test_values_by_label():
 
 def test_values_by_name():
     names, labels = {0: "air", 3: "left lung", 5: "liver", 8: "liver"}, np.array([0, 3, 5, 8])
-    law = ByLabel({"Left_Lung": 2.5, "liver": 4.0}, 1.0)
-    assert by_label(law, labels, names).tolist() == [1.0, 2.5, 4.0, 4.0]
+    mapping = ByLabel({"Left_Lung": 2.5, "liver": 4.0}, 1.0)
+    assert by_label(mapping, labels, names).tolist() == [1.0, 2.5, 4.0, 4.0]
     assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [1.0, 2.5, 1.0, 4.0]
     with pytest.raises(InputError, match=r"label 3 \(left lung\) has two values"):
         by_label(ByLabel({3: 2.5, "left lung": 4.0}), labels, names)
@@ -123,7 +123,7 @@ def test_values_by_name():
         by_label(ByLabel({"liver": 4.0}, 1.0), labels)
 
 
-def test_a_model_s_table_names_laws_and_sets():
+def test_a_model_s_table_names_mappings_and_sets():
     model = sample_model(3)
     about = {"label_table": {"1": {"name": "bright/ball"}, "0": {"name": "rest"}, "9": {"name": "far"}}}
     named = build_model(
@@ -137,7 +137,7 @@ def test_a_model_s_table_names_laws_and_sets():
     np.testing.assert_array_equal(named.sets.facets["interface_rest_bright_ball"], model.sets.facets["interface_0_1"])
 
 
-def test_the_mean_of_the_law_and_the_law_of_the_mean():
+def test_the_mean_of_the_mapping_and_the_mapping_of_the_mean():
     image, mesh = sample_image(3), sample_model(3).mesh
     fields = sample_model(3).cell_data
     by_image = build_model(mesh, image, young="1 + h**2", average="mean")
@@ -151,7 +151,7 @@ def test_the_mean_of_the_law_and_the_law_of_the_mean():
 
 
 def test_constants_are_one_material():
-    """Whatever the means over many voxels would round to; also where a law is constant in a cell."""
+    """Whatever the means over many voxels would round to; also where a mapping is constant in a cell."""
     image, mesh = sample_image(3), sample_model(3).mesh
     for young, nu in (("0.7", "0.49"), (0.7, 0.49), ("0.7 + 0*h", "0.49 + 0*h"), ([(0, 0.7), (1, 0.7)], 0.49)):
         table = build_model(mesh, image, young=young, nu=nu).materials
@@ -160,7 +160,7 @@ def test_constants_are_one_material():
     assert len(build_model(mesh, image, young="1 + h/7", nu="0.49", bins=4).materials.young) == 4
 
 
-def test_ratios_may_be_negative_and_laws():
+def test_ratios_may_be_negative_and_mappings():
     image, mesh = sample_image(3), sample_model(3).mesh
     table = build_model(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
     assert table.nu.min() < 0.0 < table.nu.max()
@@ -174,7 +174,7 @@ def test_ratios_may_be_negative_and_laws():
         build_model(mesh, young="h")
 
 
-def test_one_law_for_each_label_and_one_number_a_cell():
+def test_one_mapping_for_each_label_and_one_number_a_cell():
     model = sample_model(3)
     labels = model.cell_data["label"]
     table = build_model(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
@@ -210,7 +210,7 @@ def test_densities_that_are_none(wrong):
         density_of(materials(1.0, 0.3, 2))
 
 
-def test_density_by_law_by_label_and_from_the_moduli_s_file(tmp_path):
+def test_density_by_mapping_by_label_and_from_the_moduli_s_file(tmp_path):
     mesh = sample_model(3).mesh
     fields = sample_model(3).cell_data
     labels, mean = fields["label"], fields["mean"]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import tetopt
 from tetopt.model.formula import parse_formula
-from tetopt.model.laws import parse_law, young_from
+from tetopt.model.mappings import parse_mapping, young_from
 from tetopt.study.paper import inverse_strain
 
 H = np.array([[0.5, 1.0, 2.0], [3.0, 10.0, 250.0]])
@@ -58,12 +58,12 @@ def test_powers_are_floats(text, value):
 
 
 @given(st.text(alphabet="h0123456789.+-*/()absqrtexplogminmax, ", max_size=24))
-def test_any_text_is_a_law_or_an_input_error(text):
+def test_any_text_is_a_mapping_or_an_input_error(text):
     try:
-        law = parse_formula(text)
+        mapping = parse_formula(text)
     except tetopt.InputError:
         return
-    assert law(H).shape == H.shape
+    assert mapping(H).shape == H.shape
 
 
 def test_no_value_is_refused_with_the_intensity():
@@ -71,14 +71,16 @@ def test_no_value_is_refused_with_the_intensity():
         young_from(parse_formula("1/h"), np.array([0.0, 1.0]))
 
 
-def test_one_over_strain_is_the_papers_law():
+def test_one_over_strain_is_the_papers_mapping():
     strain = np.array([0.02, -0.01, 0.0, 0.3])
-    np.testing.assert_array_equal(young_from(parse_law("1/max(abs(h), 0.001)"), strain), inverse_strain(strain, 0.001))
+    np.testing.assert_array_equal(
+        young_from(parse_mapping("1/max(abs(h), 0.001)"), strain), inverse_strain(strain, 0.001)
+    )
 
 
-def test_law_is_a_table_or_a_formula():
-    np.testing.assert_array_equal(young_from(parse_law("0:1,100:5"), [50.0]), [3.0])
-    np.testing.assert_array_equal(young_from(parse_law("max(h, 60)"), [50.0]), [60.0])
+def test_mapping_is_a_table_or_a_formula():
+    np.testing.assert_array_equal(young_from(parse_mapping("0:1,100:5"), [50.0]), [3.0])
+    np.testing.assert_array_equal(young_from(parse_mapping("max(h, 60)"), [50.0]), [60.0])
 
 
 @pytest.mark.parametrize("text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001])

@@ -203,7 +203,7 @@ def test_weights_integrate_what_cells_of_the_order_can_be(n, order):
         np.testing.assert_allclose(squares, 2.0 * volume * centre, rtol=1e-12)
 
 
-def test_each_order_s_shares_of_a_facet():
+def test_each_order_s_parts_of_a_facet():
     """A right triangle of area 1/2, and an edge of length 2."""
     solid = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
     bottom = np.array([[0, 3]])

@@ -136,8 +136,8 @@ def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
         for name, sign in zip(pair, (-1.0, 1.0), strict=True):
             areas = area_vectors(mesh, sets[name])
             assert (sign * areas[:, axis] >= np.abs(areas).max(axis=1)).all()
-            share = np.sqrt((areas**2).sum(axis=1)).sum() / size
-            assert share == pytest.approx(0.1 if n == 3 else np.arccos(0.8) / np.pi, rel=0.35)  # by whole facets
+            fraction = np.sqrt((areas**2).sum(axis=1)).sum() / size
+            assert fraction == pytest.approx(0.1 if n == 3 else np.arccos(0.8) / np.pi, rel=0.35)  # by whole facets
             assert (sign * (mesh.points[nodes_of(mesh, sets[name])][:, axis] - centre) > 0.6 * 20.0).all()
     rows = np.concatenate(list(sets.values()))
     assert len(np.unique(rows, axis=0)) == len(rows)

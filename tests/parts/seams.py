@@ -102,7 +102,7 @@ def compared(image, nodes, n_parts):
         "mean rho of one piece": float(rhos[1].mean()),
         "1st percentile of rho": float(np.percentile(rhos[0], 1)),
         "the same of one piece": float(np.percentile(rhos[1], 1)),
-        "missed": dict(parted.result.missed),
+        "violated": dict(parted.result.violated),
         "CPU seconds": end - middle,
         "CPU seconds of one piece": middle - begin,
         "layers": {
@@ -122,5 +122,5 @@ if __name__ == "__main__":
         if name != "layers":
             print(f"{name:26} {number:.5g}" if isinstance(number, float) else f"{name:26} {number}")
     print(f"{'layer':22} voxels  E_D over one piece  rho less one piece's")
-    for name, (share, E_D, rho_less) in numbers["layers"].items():
-        print(f"{name:22} {share:6.3f}  {E_D:18.4f}  {rho_less:+.5f}")
+    for name, (fraction, E_D, rho_less) in numbers["layers"].items():
+        print(f"{name:22} {fraction:6.3f}  {E_D:18.4f}  {rho_less:+.5f}")

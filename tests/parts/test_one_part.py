@@ -138,7 +138,7 @@ def test_each_round_begins_with_the_mesh_that_the_one_before_left(run):
 
 
 def test_parts_add_up_to_the_whole(run, image):
-    """Voxels exactly, energies and their shares to rounding; of each round."""
+    """Voxels exactly, energies and their parts to rounding; of each round."""
     history = run[0].result.history
     for record, parts in zip(history, [*rounds_of(run, "measure"), *rounds_of(run, "improve")], strict=True):
         mesh, settings = whole_mesh(parts, "after"), parts[0].text["settings"]
@@ -154,7 +154,7 @@ def test_parts_add_up_to_the_whole(run, image):
         assert record.n_cells == len(mesh.cells)
 
 
-def test_what_a_part_begins_with_is_its_share_of_what_the_round_before_ended_with(run):
+def test_what_a_part_begins_with_is_its_part_of_what_the_round_before_ended_with(run):
     history = run[0].result.history
     for before, parts in zip(history, rounds_of(run, "improve"), strict=False):
         assert sum(part.numbers["E_before"] for part in parts) == pytest.approx(before.E, rel=1e-11)

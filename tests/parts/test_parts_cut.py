@@ -48,7 +48,7 @@ def by_places(ticks, cells):
 @pytest.mark.parametrize("counts", [(1, 1, 1), (2, 1, 1), (2, 3, 2)])
 def test_parts_are_numbered_without_gaps_and_are_of_equal_weight(counts, shift, weights):
     part = cut(PLACES, weights, counts, shift)
-    shares = np.bincount(part, weights) / weights.sum()
+    fractions = np.bincount(part, weights) / weights.sum()
     # Shifted there is one more along each axis that is divided, and the first and last are `1 - shift` and `shift`.
     widths = [
         np.array([1.0]) if count == 1
@@ -58,9 +58,9 @@ def test_parts_are_numbered_without_gaps_and_are_of_equal_weight(counts, shift, 
     ]  # fmt: skip
     expected = np.einsum("i,j,k->ijk", *widths).ravel()
     assert part.shape == (len(PLACES),)
-    assert len(shares) == len(expected)
+    assert len(fractions) == len(expected)
     # A cell more or less at each of three divisions.
-    np.testing.assert_allclose(shares, expected, rtol=0.0, atol=3.0 * weights.max() / weights.sum())
+    np.testing.assert_allclose(fractions, expected, rtol=0.0, atol=3.0 * weights.max() / weights.sum())
 
 
 def test_a_part_is_a_box_of_centroids():

@@ -8,7 +8,7 @@ from parted import balls, one_thread, recorded_run, request
 from seams import beside_one_piece, compared, other_layers, seam_layers
 
 import tetopt
-from tetopt.engine.promises import promised_in_box
+from tetopt.engine.requirements import checked_in_box
 from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.io.images import load_image
 from tetopt.io.mni import mni_path
@@ -22,10 +22,10 @@ def one(image):
         return tetopt.mesh_image(image, nodes=1500, iterations=12)
 
 
-def test_the_mesh_is_valid_fills_the_box_and_keeps_the_floor(run, image):
+def test_the_mesh_is_valid_fills_the_box_and_keeps_the_minimum_dihedral_angle(run, image):
     result = run[0].result
     assert tetopt.check_mesh(result.mesh, image) == []
-    assert result.missed == {}
+    assert result.violated == {}
     assert dihedral_angles(result.mesh.points, result.mesh.cells).min() > 12.0 - 1e-6
     assert {record.n_voxels for record in result.history} == {image.data.size}
 
@@ -34,13 +34,13 @@ def test_there_are_as_many_nodes_as_asked_for(run):
     assert len(run[0].result.mesh.points) == pytest.approx(1500, rel=0.01)
 
 
-def test_a_promise_that_is_missed_is_noticed(run, image):
+def test_a_requirement_that_is_violated_is_noticed(run, image):
     result = run[0].result
-    assert promised_in_box(result, image, 12.0).missed == {}
-    assert set(promised_in_box(result, image, 60.0).missed) == {"floor"}
+    assert checked_in_box(result, image, 12.0).violated == {}
+    assert set(checked_in_box(result, image, 60.0).violated) == {"min_dihedral"}
     larger = tetopt.Image(np.concatenate([image.data, image.data[:1]]), image.affine)
-    assert "floor" not in promised_in_box(result, larger, 12.0).missed
-    assert promised_in_box(result, larger, 12.0).missed
+    assert "min_dihedral" not in checked_in_box(result, larger, 12.0).violated
+    assert checked_in_box(result, larger, 12.0).violated
 
 
 def test_nodes_that_the_octree_lacks_are_shared_among_the_parts(tmp_path):
@@ -76,13 +76,13 @@ def test_a_run_in_parts_is_nearly_as_good_as_one_in_one_piece(run, one):
     assert rho(mesh.points, mesh.cells).mean() > rho(one.mesh.points, one.mesh.cells).mean() - 0.01
 
 
-def assert_unseen(seams, others, share):
-    """Beside seams of any round E_D and rho, beside one piece, are as along any planes, to a share of E_D."""
+def assert_unseen(seams, others, fraction):
+    """Beside seams of any round E_D and rho, beside one piece, are as along any planes, to a fraction of E_D."""
     (E_D, rho_less), (E_D_others, rho_less_others) = np.mean(seams, axis=0), np.mean(others, axis=0)
-    assert E_D < (1.0 + share) * E_D_others
+    assert E_D < (1.0 + fraction) * E_D_others
     assert rho_less > rho_less_others - 0.001
     # The last round's, after which nothing moves any more.
-    assert seams[-1][0] < (1.0 + 2.0 * share) * E_D_others
+    assert seams[-1][0] < (1.0 + 2.0 * fraction) * E_D_others
 
 
 def test_seams_are_not_seen(run, one, image):
@@ -101,7 +101,7 @@ def test_the_mni152_brain_in_parts_is_that_of_one_piece():
     pytest.importorskip("nilearn", reason="the MNI152 brain is in nilearn's wheel")
     numbers = compared(load_image(mni_path("t1")), 40_000, 4)
     assert numbers["nodes"] == pytest.approx(40_000, rel=0.01)
-    assert numbers["missed"] == {}
+    assert numbers["violated"] == {}
     assert numbers["E_D over one piece"] < 1.03
     assert numbers["mean rho"] == pytest.approx(numbers["mean rho of one piece"], abs=0.005)
     layers = numbers["layers"]

@@ -2,7 +2,7 @@
 
     python tests/random/operations.py --seed 1 --operations 1000000
 
-Weights of shape and image, floors and numbers of nodes change at random between them, so that nothing settles.
+Weights of shape and image, angle limits and numbers of nodes change at random between them, so that nothing settles.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from tetopt.start.sizes import Sizes
 
 CHECKED_EVERY = 1000  # operations
 WORLD_OPERATIONS = 10_000  # then another world
-OVERLAP = "overlap within a mask"  # on the surface of details as small as cells: a run says so (`MeshingResult.missed`)
+# on the surface of details as small as cells: a run says so (`MeshingResult.violated`)
+OVERLAP = "overlap within a mask"
 KINDS = ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces", "labels")
 
 
@@ -47,10 +48,10 @@ def begun(rng):
 def operate(run, rng, made):
     """One random step; adds to `made` how many operations it was."""
     objective = run.state.objective
-    share = 10.0 ** rng.uniform(-1.5, 1.5)
-    run.state = run.state._replace(objective=objective._replace(geometry=objective.geometry * share))
+    fraction = 10.0 ** rng.uniform(-1.5, 1.5)
+    run.state = run.state._replace(objective=objective._replace(geometry=objective.geometry * fraction))
     if run.n == 3:
-        run.keep_floor(float(rng.choice([0.0, 3.0, 8.0, 12.0, 20.0])))
+        run.keep_min_dihedral(float(rng.choice([0.0, 3.0, 8.0, 12.0, 20.0])))
     run.hope[:] = np.inf
     kind = str(rng.choice(KINDS, p=[0.35, 0.25, 0.2, 0.1, 0.05, 0.05]))
     before = run.state.complex.ticks.copy()

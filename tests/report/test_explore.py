@@ -202,7 +202,7 @@ const warped = async () => {
   said.second = state();
   said.size = [canvas.width, canvas.height];
   said.cells = grid();
-  press("inside", "both"); slide("share", 0);
+  press("inside", "both"); slide("fraction", 0);
   await frame();
   said.carried = grid();
   press("inside", "cells");
@@ -409,12 +409,12 @@ def cells_at(mesh, xyz):
     gradients = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2)  # (M, 3, 4)
     cells, distances = np.full(len(xyz), -1), np.zeros(len(xyz))
     for k, place in enumerate(xyz):
-        share = np.einsum("mij,mi->mj", gradients, place - corners[:, 0]) + np.eye(4)[0]
-        inside = share.min(axis=1)
+        fraction = np.einsum("mij,mi->mj", gradients, place - corners[:, 0]) + np.eye(4)[0]
+        inside = fraction.min(axis=1)
         if inside.max() > 0:
             cells[k] = inside.argmax()
             slopes = np.linalg.norm(gradients[cells[k], :2], axis=0)
-            distances[k] = (share[cells[k]] / slopes).min()
+            distances[k] = (fraction[cells[k]] / slopes).min()
     return cells, distances
 
 
@@ -538,15 +538,15 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     assert len(clear) > 300
     corners = shape.points[mesh.cells[cells[clear]]]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    shares = np.linalg.solve(edges, (places[clear] - corners[:, 0])[..., None])[..., 0]
+    fractions = np.linalg.solve(edges, (places[clear] - corners[:, 0])[..., None])[..., 0]
     field = exhibit(mesh, {}, point_data=pressed(mesh)).fields[1]
     at_corners = field.nodes[mesh.cells[cells[clear]]]
-    values = at_corners[:, 0] + (shares * (at_corners[:, 1:] - at_corners[:, :1])).sum(axis=1)
+    values = at_corners[:, 0] + (fractions * (at_corners[:, 1:] - at_corners[:, :1])).sum(axis=1)
     low, high = field.limits
     step = np.rint(255 * np.clip((values - low) / (high - low), 0, 1)).astype(int)
     np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3)
     rest = mesh.points[mesh.cells[cells[clear]]]
-    index = image.to_index(rest[:, 0] + (shares[..., None] * (rest[:, 1:] - rest[:, :1])).sum(axis=1)) + 0.5
+    index = image.to_index(rest[:, 0] + (fractions[..., None] * (rest[:, 1:] - rest[:, :1])).sum(axis=1)) + 0.5
     is_inside = ((index > 0.05) & (index < np.array(image.shape) - 0.05)).all(axis=1)
     is_inside &= (np.abs(index - np.rint(index)) > 0.02).all(axis=1)
     low, high = np.percentile(image.data, [0.5, 99.5])

@@ -564,7 +564,7 @@ def test_a_mask_of_another_shape_is_refused():
 
 
 @pytest.mark.parametrize("n", [2, 3])
-def test_histograms_are_shares(n):
+def test_histograms_are_fractions(n):
     image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
     meshes = [("first", lattice_mesh(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
     figure = histogram_figure(meshes)
@@ -632,9 +632,9 @@ def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):
     assert list(saved) == paths
     slice_axes = np.array(saved[paths[0]].axes).reshape(2, 2)
     assert slice_axes[0, 0].get_title() == f"lattice, {len(initial.points)} nodes"
-    share = result.history[-1].E_D / result.history[0].E_D
-    assert share < 0.95
-    assert slice_axes[0, 1].get_title() == f"optimised, {share:.3f} of its E_D"
+    fraction = result.history[-1].E_D / result.history[0].E_D
+    assert fraction < 0.95
+    assert slice_axes[0, 1].get_title() == f"optimised, {fraction:.3f} of its E_D"
     view = SliceView(image, None, None)
     for column, mesh in enumerate((initial, result.mesh)):
         for row in (0, 1):

@@ -45,7 +45,7 @@ def summary(image, initial, result):
 def test_keys(summary):
     assert list(summary) == [
         *("image", "image_sha256", "options", "versions", "machine", "image_properties", "ended", "iterations_done"),
-        *("energies", "quality_initial", "quality", "history", "seconds", "mesh_sha256", "missed"),
+        *("energies", "quality_initial", "quality", "history", "seconds", "mesh_sha256", "violated"),
     ]
     assert summary["options"] == {"k_D": 0.2}
     assert summary["seconds"] == {"all": 1.5}
@@ -67,8 +67,8 @@ def test_energies_are_those_of_the_meshes(summary, image, initial, result):
     assert energies["E_G_relative"] == pytest.approx(shape, rel=1e-9)
     assert energies["E_D_relative"] == pytest.approx(fit / fit_initial, rel=1e-9)
     assert energies["E"] == pytest.approx(0.8 * shape + 0.2 * fit / fit_initial, rel=1e-9)
-    assert energies["E_D_share_of_variance"] == pytest.approx(fit / total, rel=1e-9)
-    assert energies["E_D_share_of_variance_initial"] == pytest.approx(fit_initial / total, rel=1e-9)
+    assert energies["E_D_fraction_of_variance"] == pytest.approx(fit / total, rel=1e-9)
+    assert energies["E_D_fraction_of_variance_initial"] == pytest.approx(fit_initial / total, rel=1e-9)
     assert energies["E_D_relative"] < 0.9  # so that before and after differ
 
 
@@ -101,12 +101,12 @@ def test_total_variation_is_E_D_of_one_cell_around_everything():
     assert image_summary(image)["total_variation"] == pytest.approx(E_D(image, mesh), rel=1e-9)
 
 
-def test_a_constant_image_has_no_shares(tmp_path):
+def test_a_constant_image_has_no_fractions(tmp_path):
     image = Image(np.full((8, 9), 7.0))
     initial = lattice_mesh(image, blocks=(2, 2))
     summary = run_summary(image, initial, optimize_paper(image, initial, iterations=1), {}, {})
-    shares = ["E_D_relative", "E_D_share_of_variance", "E_D_share_of_variance_initial"]
-    assert [summary["energies"][name] for name in shares] == [None] * 3
+    fractions = ["E_D_relative", "E_D_fraction_of_variance", "E_D_fraction_of_variance_initial"]
+    assert [summary["energies"][name] for name in fractions] == [None] * 3
     save_json(tmp_path / "run.json", summary)
     assert json.loads((tmp_path / "run.json").read_text())["energies"]["E_D_relative"] is None
 

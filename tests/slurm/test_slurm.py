@@ -161,7 +161,7 @@ def test_six_subjects(slurm, image, tmp_path):
     for k in range(1, 7):
         path = numbers_path(out, f"sub-{k}")
         numbers = numbers_in(path)
-        assert numbers["missed"] == {}
+        assert numbers["violated"] == {}
         assert load_mesh(path.with_suffix(".vtu")).mesh.cells.shape[0] > 500
     assert (out / "cohort.html").is_file()
     assert {path.name for path in (out / ".work").iterdir()} <= {"lock", "tetopt-manifest"}

@@ -298,9 +298,9 @@ def test_lps_and_megapascals_are_the_same_loads(tmp_path):
 def test_large_deformation_begins_as_the_linear_step(kind, order, moduli, tmp_path):
     """A hundredth of the load: the same within a few per cent of that hundredth; the whole of it runs, and differs."""
     energies = []
-    for share in (0.01, 1.0):
-        pressed = ["hold:superior", f"pressure:inferior:{0.1 * share}"]
-        words = {"compress": [f"compress:{20.0 * share}%"], "pressure": pressed}
+    for fraction in (0.01, 1.0):
+        pressed = ["hold:superior", f"pressure:inferior:{0.1 * fraction}"]
+        words = {"compress": [f"compress:{20.0 * fraction}%"], "pressure": pressed}
         model = loaded_model(words[kind], order=order, moduli=moduli)
         printed = answer(abaqus(model._replace(is_nonlinear=True)), tmp_path)
         energies.append(energy(printed) / solve(model).strain_energy)

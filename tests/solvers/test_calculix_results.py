@@ -34,14 +34,14 @@ def test_from_image_to_solver_and_back(tmp_path):
     """By the commands, in MPa and LPS there: the displacements are those of `tetopt fem`."""
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image(tmp_path / "a.nii.gz", image)
-    law = ["--young", "0.5 + h/7", "--nu", "0.3"]
+    mapping = ["--young", "0.5 + h/7", "--nu", "0.3"]
     mesh = ["mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", "--spacing", "12", "--iterations", "0"]
     assert exit_code(*mesh) == 0
-    inp = ["convert", tmp_path / "a.vtu", tmp_path / "a.inp", "--image", tmp_path / "a.nii.gz", *law]
+    inp = ["convert", tmp_path / "a.vtu", tmp_path / "a.inp", "--image", tmp_path / "a.nii.gz", *mapping]
     assert exit_code(*inp, "--load", "compress:3%", "--units", "MPa", "--space", "lps") == 0
     run(tmp_path, "a")
     assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--results", tmp_path / "a.frd") == 0
-    fem = ["fem", tmp_path / "a.nii.gz", tmp_path / "a.vtu", *law, "--compress", "3", "-o", tmp_path / "c.vtu"]
+    fem = ["fem", tmp_path / "a.nii.gz", tmp_path / "a.vtu", *mapping, "--compress", "3", "-o", tmp_path / "c.vtu"]
     assert exit_code(*fem) == 0
     theirs, ours = (tetopt.load_mesh(tmp_path / name).point_data["displacement"] for name in ("b.vtu", "c.vtu"))
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-5 * np.abs(ours).max())

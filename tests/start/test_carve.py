@@ -59,8 +59,8 @@ def test_what_a_mesh_tears_off_is_dropped_and_told():
     result = tetopt.mesh_image(target, 400, iterations=3)
     assert result.n_dropped == 1
     assert components(result.mesh.cells).max() == 0
-    assert result.missed == {}
+    assert result.violated == {}
     kept = tetopt.mesh_image(content(image, mask=mask, keep_components=True), 400, iterations=3)
     assert kept.n_dropped == 0
     assert components(kept.mesh.cells).max() == 1
-    assert list(kept.missed) == ["components"]
+    assert list(kept.violated) == ["components"]

@@ -170,12 +170,12 @@ def test_shapes_of_criss_cross_on_squares():
 
 @pytest.mark.parametrize("kind", ["bcc", "five-tet"])
 @pytest.mark.parametrize(
-    ("nodes", "share"), [(100, 0.1), (250, 0.1), (500, 0.1), (1000, 0.06), (2048, 0.06), (5000, 0.03), (14000, 0.03)]
+    ("nodes", "fraction"), [(100, 0.1), (250, 0.1), (500, 0.1), (1000, 0.06), (2048, 0.06), (5000, 0.03), (14000, 0.03)]
 )
-def test_node_counts_on_a_brain(kind, nodes, share):
+def test_node_counts_on_a_brain(kind, nodes, fraction):
     """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 % are kept."""
     mesh = lattice_mesh(BRAIN, kind, nodes=nodes)
-    assert abs(len(mesh.points) - nodes) <= share * nodes
+    assert abs(len(mesh.points) - nodes) <= fraction * nodes
 
 
 @given(seeds, st.integers(1000, 6000), st.sampled_from(["bcc", "five-tet"]))

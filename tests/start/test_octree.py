@@ -71,7 +71,7 @@ def test_octree_is_a_good_mesh_of_the_box(name):
 
 @pytest.mark.parametrize("name", IMAGES)
 def test_mesh_image(name):
-    """The whole way: a mesh above the floor with that many nodes, every voxel in one cell, no more E_D than before."""
+    """The whole way: no flat cell, that many nodes, every voxel in one cell, no more E_D than before."""
     image, nodes = IMAGES[name]
     result = tetopt.mesh_image(image, nodes, iterations=10)
     first, last = result.history[0], result.history[-1]
@@ -102,15 +102,15 @@ def test_nodes_do_not_follow_noise(monkeypatch):
     data = rng.normal(0.0, 20.0, (64, 40, 40))
     data[:32] += 30.0 * np.sin(grid(64, 40, 40)[:32, ..., 1] / 3.0)
 
-    def share_in_wave():
+    def fraction_in_wave():
         image = tetopt.Image(data)
         index = image.to_index(octree_mesh(image, 2000, tetopt.Sizes(longest=np.inf)).points)
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
-    known = share_in_wave()
+    known = fraction_in_wave()
     monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "sampled_noise", lambda sample: 0.0)
     assert known > 0.75
-    assert share_in_wave() < 0.7
+    assert fraction_in_wave() < 0.7
 
 
 def test_noise_alone_gets_a_uniform_mesh():

@@ -84,8 +84,8 @@ def test_targets_in_one_half(shape, stretch):
     image = ball(*shape)
     field = half_sized(image, 5.0 if len(shape) == 3 else 4.0, stretch=stretch)
     sizes = Sizes(field=field)
-    nodes, share = nodes_of_sizes(image, sizes)
-    assert share == pytest.approx(0.5, abs=0.04)
+    nodes, fraction = nodes_of_sizes(image, sizes)
+    assert fraction == pytest.approx(0.5, abs=0.04)
     mesh = tetopt.mesh_image(image, nodes, sizes=sizes).mesh
     assert len(mesh.points) == nodes
     assert tetopt.check_mesh(mesh, image) == []
@@ -104,14 +104,14 @@ def test_targets_ask_for_nothing_that_is_there():
     image = ball(48, 40, 44)
     free = tetopt.mesh_image(image, 700, sizes=Sizes(longest=np.inf), iterations=6).mesh
     for largest in (np.inf, 500.0):
-        mesh = tetopt.mesh_image(image, 700, sizes=Sizes(largest=largest), iterations=6).mesh
+        mesh = tetopt.mesh_image(image, 700, sizes=Sizes(edge_size=largest), iterations=6).mesh
         assert mesh.points.tobytes() == free.points.tobytes()
 
 
 @pytest.mark.parametrize("count", [150, 6000])
 def test_targets_from_any_mesh(count):
     """A lattice with a fifth of the nodes, or five times as many, ends with the number and its edges."""
-    image, sizes = ball(48, 40, 44), Sizes(largest=6.0)
+    image, sizes = ball(48, 40, 44), Sizes(edge_size=6.0)
     nodes = nodes_of_sizes(image, sizes)[0]
     start = tetopt.lattice_mesh(image, nodes=count)
     mesh = tetopt.optimize(image, start, k_D=0.85, nodes=nodes, sizes=sizes, iterations=16).mesh
@@ -144,7 +144,7 @@ def test_targets_without_the_image(shape):
 def test_nodes_follow_from_sizes():
     """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a field of one half."""
     image = ball(30, 30, 30)
-    sizes = Sizes(largest=6.0)
+    sizes = Sizes(edge_size=6.0)
     result = tetopt.mesh_image(image, sizes=sizes, iterations=6)
     assert result.nodes == nodes_of_sizes(image, sizes)[0] == len(result.mesh.points)
     in_all = tetopt.mesh_image(image, sizes=sizes, iterations=4, order=2).nodes
@@ -185,22 +185,22 @@ def test_equilateral_nodes_of_a_mask(shape):
     around = 0.5 * 2.0 * np.pi * radius / 4.0 if n == 2 else EQUILATERAL_NODES[2] * 2.0 * np.pi * radius**2 / 16.0
     assert whole - body == pytest.approx(around, rel=0.05)
     content = tetopt.content(tetopt.Image(1.0 * inside), mask=tetopt.Image(1.0 * inside))
-    assert nodes_of_sizes(content, Sizes(largest=4.0))[0] == pytest.approx(1.5 * whole, abs=1.0)
+    assert nodes_of_sizes(content, Sizes(edge_size=4.0))[0] == pytest.approx(1.5 * whole, abs=1.0)
 
 
 def test_edge_ratios():
     """Each edge once, over the mean of the targets at its ends, and only where both have one."""
     image = ball(20, 20, 20)
     mesh = tetopt.lattice_mesh(image, "five-tet", blocks=(4, 4, 4))
-    ratios = edge_ratios(mesh.points, mesh.cells, Sizes(largest=5.0))
+    ratios = edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=5.0))
     n_short, n_long = 3 * 4 * 25, 6 * 4 * 4 * 5 // 2
     assert ratios.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long))
-    assert sum(ratios.share) == pytest.approx(1.0)
-    assert ratios.share[RATIO_BINS.index(1.0)] == pytest.approx(n_short / (n_short + n_long))
+    assert sum(ratios.fraction) == pytest.approx(1.0)
+    assert ratios.fraction[RATIO_BINS.index(1.0)] == pytest.approx(n_short / (n_short + n_long))
     assert (ratios.above, ratios.below) == (0.0, 0.0)
-    tight = edge_ratios(mesh.points, mesh.cells, Sizes(largest=4.0))
+    tight = edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=4.0))
     assert tight.above == pytest.approx(n_long / (n_short + n_long))
-    assert edge_ratios(mesh.points, mesh.cells, Sizes(largest=8.0)).below == pytest.approx(1.0 - tight.above)
+    assert edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=8.0)).below == pytest.approx(1.0 - tight.above)
     in_half = edge_ratios(mesh.points, mesh.cells, Sizes(field=half_sized(image, 5.0)))
     n_short, n_long = 2 * 25 + 2 * 2 * 4 * 5, 4 * 4 * 2 + 2 * (2 * 4 * 5)
     assert in_half.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long), rel=0.05)
@@ -272,7 +272,7 @@ def test_sizes_around_are_the_twin_s():
     np.testing.assert_allclose(_around(own, mesh.points, mesh.cells, 0.3), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("sizes", [Sizes(longest=4.0), Sizes(longest=7.0), Sizes(largest=5.0)])
+@pytest.mark.parametrize("sizes", [Sizes(longest=4.0), Sizes(longest=7.0), Sizes(edge_size=5.0)])
 def test_a_refusal_names_a_number_that_will_do(sizes):
     image = tetopt.Image(100.0 * (np.indices((30, 30, 30)).sum(0) > 40))
     with pytest.raises(tetopt.InputError, match="ask for") as refusal:
@@ -286,12 +286,12 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
     [
         (Sizes(smallest=-1.0), "smallest: expected 0 mm or more, got -1"),
         (Sizes(smallest=float("nan")), "smallest"),
-        (Sizes(largest=0.0), "largest: expected a length above 0 mm"),
-        (Sizes(largest=float("nan")), "largest: expected a length above 0 mm"),
+        (Sizes(edge_size=0.0), "edge_size: expected a length above 0 mm"),
+        (Sizes(edge_size=float("nan")), "edge_size: expected a length above 0 mm"),
         (Sizes(longest=0.0), "longest: expected a length above 0 mm"),
         (Sizes(smallest=5.0, longest=4.0), "longest: 4 mm is below the smallest size, 5 mm"),
         (Sizes(longest=0.3), "500 nodes are too few .* they need"),
-        (Sizes(smallest=5.0, largest=4.0), "largest: 4 mm is below the smallest size, 5 mm"),
+        (Sizes(smallest=5.0, edge_size=4.0), "edge_size: 4 mm is below the smallest size, 5 mm"),
         (Sizes(gradation=0.0), "gradation: expected 0.05"),
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
         (Sizes(field=tetopt.Image(np.ones((4, 4)))), "field: expected one in 3-D"),
@@ -299,8 +299,8 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
         (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "500 nodes are too few .* they need"),
         (Sizes(smallest=100.0), "smallest: 100 mm is longer than the box, 30 mm"),
         (Sizes(smallest=1e300), "longer than the box"),
-        (Sizes(largest=0.3), "500 nodes are too few .* they need"),
-        (Sizes(largest=1e-6), "500 nodes are too few .* they need"),
+        (Sizes(edge_size=0.3), "500 nodes are too few .* they need"),
+        (Sizes(edge_size=1e-6), "500 nodes are too few .* they need"),
         (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
         (
             Sizes(field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))),
@@ -406,8 +406,8 @@ def test_a_stop_keeps_what_has_the_error():
 
         result = meshed_to_error(image, 0.0005, None, run)
         assert len(count) == stops_at
-        share = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
-        assert (share <= 0.0005) == has_error
+        fraction = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
+        assert (fraction <= 0.0005) == has_error
         assert (result.ended == "stopped") != has_error
         assert result.nodes in count
 
@@ -433,8 +433,8 @@ def test_target_error_within_limits():
     fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(longest=9.0))
     assert edges(fine.mesh)[1].max() < 11.0
     assert fine.history[-1].E_D < 0.1 * total
-    sized = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(largest=6.0))
-    assert sized.nodes == nodes_of_sizes(image, Sizes(largest=6.0))[0] == len(sized.mesh.points)
+    sized = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(edge_size=6.0))
+    assert sized.nodes == nodes_of_sizes(image, Sizes(edge_size=6.0))[0] == len(sized.mesh.points)
     coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, longest=40.0))
     assert edges(coarse.mesh)[1].mean() > 9.0
     assert coarse.history[-1].E_D > 0.001 * total
@@ -445,10 +445,10 @@ def test_target_error_within_limits():
     [
         (ball(30, 30, 30), {}, "one of them"),
         (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "one of them"),
-        (ball(30, 30, 30), {"target_error": 1.0}, "expected a share of the image's variance, 0 to 1"),
-        (ball(30, 30, 30), {"target_error": float("nan")}, "expected a share"),
+        (ball(30, 30, 30), {"target_error": 1.0}, "expected a fraction of the image's variance, 0 to 1"),
+        (ball(30, 30, 30), {"target_error": float("nan")}, "expected a fraction"),
         (tetopt.Image(np.ones((30, 30, 30))), {"target_error": 0.1}, "the image is constant"),
-        (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise's share"),
+        (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise's fraction"),
     ],
 )
 def test_targets_that_cannot_be(image, arguments, words):

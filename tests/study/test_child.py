@@ -90,7 +90,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
 
 
 def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):
-    """A stranger's image may lie in one with a numpy.py."""
+    """An untrusted image may lie in one with a numpy.py."""
     for name in ("numpy", "json", "tempfile"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
     monkeypatch.chdir(tmp_path)

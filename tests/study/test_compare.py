@@ -17,7 +17,7 @@ from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
-from tetopt.model.laws import parse_law
+from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
 from tetopt.study import compare, compare_files, tradeoff
 from tetopt.study.compare_files import COMPARE_PICTURES
@@ -83,7 +83,7 @@ def test_files(run):
 
 
 def test_numbers_are_those_of_the_meshes(run, head):
-    """E_D's share and Dice, recomputed voxel by voxel from the mesh file, and the library's measures of its labels."""
+    """E_D and Dice, recomputed voxel by voxel from the mesh file, and the library's measures of its labels."""
     report = json.loads((run / "report.json").read_text())
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     h, true = image.data.astype(float).ravel(), labels.data.astype(int).ravel()
@@ -95,7 +95,7 @@ def test_numbers_are_those_of_the_meshes(run, head):
         means = np.bincount(owner, weights=h) / np.maximum(np.bincount(owner), 1)
         within = ((h - means[owner]) ** 2).sum()
         median = pipeline["median"]
-        assert median["E_D_share"] == pytest.approx(within / ((h - h.mean()) ** 2).sum(), rel=1e-9)
+        assert median["E_D_fraction"] == pytest.approx(within / ((h - h.mean()) ** 2).sum(), rel=1e-9)
         assert median["n_missed_voxels"] == 0
         votes = np.zeros((owner.max() + 1, true.max() + 1), dtype=int)
         np.add.at(votes, (owner, true), 1)
@@ -117,14 +117,14 @@ def test_numbers_are_those_of_the_meshes(run, head):
             for name in ("area_ratio", "folded", "nonmanifold_edges", "nonmanifold_edges_two_labels"):
                 value = getattr(surface, name)
                 assert row[name] == (None if np.isnan(value) else pytest.approx(value))  # nan where no cell has it
-        assert sum(row["E_D_share"] for row in median["labels"]) == pytest.approx(median["E_D_share"], rel=1e-9)
+        assert sum(row["E_D_fraction"] for row in median["labels"]) == pytest.approx(median["E_D_fraction"], rel=1e-9)
 
 
 def test_the_keys_of_the_report(run):
     """What other programs read: a field that is renamed would rename its key."""
     report = json.loads((run / "report.json").read_text())
     assert set(report) == {
-        *("command", "curves", "image", "labels", "law", "machine", "options", "pipelines", "reference", "seconds"),
+        *("command", "curves", "image", "labels", "mapping", "machine", "options", "pipelines", "reference", "seconds"),
         *("date", "headline", "quadratic", "tradeoff", "versions"),
     }
     assert set(report["headline"]) == {"title", "remarks", "claims", "behind"}
@@ -135,12 +135,21 @@ def test_the_keys_of_the_report(run):
     assert set(pipeline) == {*keys, "reason", "crashes"}
     median = pipeline["median"]
     assert set(median) == {
-        *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_corners", "n_empty_cells"),
+        *("E_D", "E_D_fraction", "dihedral_histogram", "fem", "labels", "n_cells", "n_corners", "n_empty_cells"),
         *("n_missed_voxels", "order"),
         *("n_nodes", "not_compressed", "peak_bytes", "quality", "rho_histogram", "seconds", "seconds_total"),
     }
     assert set(median["labels"][0]) == {
-        *("E_D_share", "components", "dice", "is_lost", "label", "mesh_components", "mesh_volume_mm3", "mesh_voxels"),
+        *(
+            "E_D_fraction",
+            "components",
+            "dice",
+            "is_lost",
+            "label",
+            "mesh_components",
+            "mesh_volume_mm3",
+            "mesh_voxels",
+        ),
         *("surface_mean_mm", "surface_p95_mm", "volume_mm3", "voxels"),
         *("area_ratio", "folded", "nonmanifold_edges", "nonmanifold_edges_two_labels"),
     }
@@ -151,7 +160,7 @@ def test_the_keys_of_the_report(run):
         *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
         *("average", "programs", "reference_dofs", "reference_seconds", "repeats", "tradeoff"),
     }
-    assert set(report["curves"][0]["points"][0]) == {"E_D_share", "fem", "n_nodes"}
+    assert set(report["curves"][0]["points"][0]) == {"E_D_fraction", "fem", "n_nodes"}
     assert set(report["curves"][0]) == {"name", "order", "points", "title"}
     assert [each["name"] for each in report["quadratic"]] == [each["name"] for each in report["pipelines"]]
 
@@ -161,7 +170,7 @@ def test_runs_are_read_back_as_they_were_written(run):
         row = json.loads(path.read_text())["content"]
         attempt = from_json(Attempt, row)
         assert as_json(attempt) == row
-        assert sum(attempt.run.measurement.rho_histogram.share) == pytest.approx(1.0)
+        assert sum(attempt.run.measurement.rho_histogram.fraction) == pytest.approx(1.0)
         assert attempt.run.measurement.fem["0.3"].averages["mean"].errors == Errors(
             **row["fem"]["0.3"]["averages"]["mean"]["errors"]
         )
@@ -170,8 +179,8 @@ def test_runs_are_read_back_as_they_were_written(run):
 def test_the_image_helps_and_the_reference_is_one(run):
     """tetopt has less E_D than both controls; all are judged by one reference; curves have two points."""
     report = json.loads((run / "report.json").read_text())
-    share = {p["name"]: p["median"]["E_D_share"] for p in report["pipelines"]}
-    assert share["tetopt"] < 0.5 * min(share["bcc"], share["odt"])
+    fraction = {p["name"]: p["median"]["E_D_fraction"] for p in report["pipelines"]}
+    assert fraction["tetopt"] < 0.5 * min(fraction["bcc"], fraction["odt"])
     for pipeline in [*report["pipelines"], *report["quadratic"]]:
         for nu, fem in pipeline["median"]["fem"].items():
             energy = report["reference"][nu]["strain_energy"]
@@ -186,9 +195,9 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
     """About as many nodes in all; its errors are those of the library, solved anew from its file."""
     report = json.loads((run / "report.json").read_text())
     image = tetopt.load_image(head / "image.nii.gz")
-    law, _ = compare.default_law(image)
+    mapping, _ = compare.default_mapping(image)
     settings = Settings(400, reference_dofs=REFERENCE_DOFS)
-    modulus = averaged(young_image(image, law), compare.reference_shape(image.shape, image.spacing, REFERENCE_DOFS))
+    modulus = averaged(young_image(image, mapping), compare.reference_shape(image.shape, image.spacing, REFERENCE_DOFS))
     exact = reference(modulus, 0.45)
     labels = nearest(tetopt.load_image(head / "labels.nii.gz"), modulus).data
     for pipeline in report["quadratic"]:
@@ -234,12 +243,12 @@ def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
         assert len(defaults) == 2
         assert all(measured == defaults[0] for measured in defaults)
         own = results[0]["median"]
-        assert {k: own[k] for k in ("E_D_share", "quality", "n_nodes")} == {
-            k: defaults[0][k] for k in ("E_D_share", "quality", "n_nodes")
+        assert {k: own[k] for k in ("E_D_fraction", "quality", "n_nodes")} == {
+            k: defaults[0][k] for k in ("E_D_fraction", "quality", "n_nodes")
         }
         assert without_seconds(own["fem"]) == without_seconds(defaults[0]["fem"])
     by_k_D = [row["measured"] for row in rows if row["option"] == "k_D" and row["order"] == 1]
-    assert by_k_D[0]["E_D_share"] > by_k_D[-1]["E_D_share"]
+    assert by_k_D[0]["E_D_fraction"] > by_k_D[-1]["E_D_fraction"]
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert (out / "tradeoff.png").stat().st_size > 20_000
     assert "What tetopt&#x27;s options trade" in (out / "report.html").read_text()
@@ -308,13 +317,15 @@ OTHER_SETTINGS = {  # of each setting that numbers depend on another value
 def test_a_run_of_other_options_is_not_kept(head, tmp_path):
     """Every setting either changes what a finished run is known by, or is one that no run's numbers depend on."""
     image = tetopt.load_image(head / "image.nii.gz")
-    law = tmp_path / "law.csv"
-    law.write_text("intensity,young\n0,1\n100,10\n")
+    mapping = tmp_path / "mapping.csv"
+    mapping.write_text("intensity,young\n0,1\n100,10\n")
 
     def key(settings=Settings(nodes=400), image=image, crop=None, labels=None):  # noqa: B008
         source = ImageSource("image", "ab", None, crop)
         of_labels = labels and LabelSource("labels", "given", labels)
-        comparison = compare.Comparison(image, None, parse_law(str(law)), settings, source, of_labels, str(law), "")
+        comparison = compare.Comparison(
+            image, None, parse_mapping(str(mapping)), settings, source, of_labels, str(mapping), ""
+        )
         facts = compare._facts(comparison)
         return compare._key(compare.Bench(comparison, None, {}, tmp_path, print, True, facts), "bcc")
 
@@ -323,15 +334,15 @@ def test_a_run_of_other_options_is_not_kept(head, tmp_path):
     assert key() == first
     keys = [key(Settings(nodes=400)._replace(**{name: value})) for name, value in OTHER_SETTINGS.items()]
     keys += [key(crop="0:5,:,:"), key(labels="cd"), key(labels="ef")]
-    law.write_text("intensity,young\n0,1\n100,20\n")  # the same words, another law
+    mapping.write_text("intensity,young\n0,1\n100,20\n")  # the same words, another mapping
     keys.append(key())
     assert len({first, *keys}) == len(keys) + 1
-    program = Program("bcc", f"sh {law} {{image}} {{output}}")
+    program = Program("bcc", f"sh {mapping} {{image}} {{output}}")
     of_program = [
         key(Settings(400, programs=(program,))),
         key(Settings(400, programs=(program._replace(command="a"),))),
     ]
-    law.write_text("intensity,young\n0,1\n100,30\n")
+    mapping.write_text("intensity,young\n0,1\n100,30\n")
     of_program.append(key(Settings(400, programs=(program,))))
     assert len({key(), *of_program}) == 4
 
@@ -468,7 +479,7 @@ def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
     image = tetopt.load_image(head / "image.nii.gz")
     settings = Settings(nodes=150, reference_seconds=5.0)
     comparison = compare.Comparison(
-        image, None, [(0.0, 1.0), (100.0, 10.0)], settings, ImageSource("image", "ab", None, None), None, "law", ""
+        image, None, [(0.0, 1.0), (100.0, 10.0)], settings, ImageSource("image", "ab", None, None), None, "mapping", ""
     )
     sizes = iter(Budget(dofs, dofs == 6000) for dofs in range(5000, 10000, 1000))
     monkeypatch.setattr(compare, "affordable_dofs", lambda *arguments: next(sizes))
@@ -491,7 +502,7 @@ def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
     assert "in the free memory; `reference_dofs` 6000" in lines[1]
     # Of another part of the image, and with other moduli, the grid that fits is another.
     assert chosen(comparison._replace(image_source=ImageSource("image", "ab", None, "0:5,:,:"))) == 8000
-    assert chosen(comparison._replace(law=[(0.0, 1.0), (100.0, 20.0)])) == 9000
+    assert chosen(comparison._replace(mapping=[(0.0, 1.0), (100.0, 20.0)])) == 9000
     (tmp_path / "reference.json").write_text("{")
     with pytest.raises(StopIteration):
         chosen()

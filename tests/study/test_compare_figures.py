@@ -93,7 +93,7 @@ def test_histograms_are_those_of_the_report():
         assert list(outlines) == [p.title for p in finished(report)]
         for pipeline in finished(report):
             histogram = getattr(pipeline.median.measurement, name)
-            np.testing.assert_array_equal(outlines[pipeline.title].values, histogram.share)
+            np.testing.assert_array_equal(outlines[pipeline.title].values, histogram.fraction)
             np.testing.assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
 
 
@@ -124,7 +124,7 @@ def test_curves_without_finite_elements_show_E_D(tmp_path):
             point.fem.clear()
     (axes,) = curves_figure(report).axes
     first = report.curves[0].points
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p.E_D_share for p in first])
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p.E_D_fraction for p in first])
     save_figure(curves_figure(report._replace(curves=[])), tmp_path / "a.png", dpi=40)
 
 

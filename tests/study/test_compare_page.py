@@ -61,7 +61,7 @@ def fake_run(seed, scale, order=1):
     labels = [
         LabelRow(
             label=k, voxels=9000 // (4**k), mesh_voxels=round(9000 // 4**k * some(0.8, 1.1)) * (k < 3),
-            dice=some(0.7, 0.98) * (k < 3), E_D_share=0.02 * scale, is_lost=k == 3,
+            dice=some(0.7, 0.98) * (k < 3), E_D_fraction=0.02 * scale, is_lost=k == 3,
             volume_mm3=72000.0 / 4**k, mesh_volume_mm3=72000.0 / 4**k * some(0.8, 1.1) * (k < 3),
             surface_mean_mm=some(0.4, 2.0) if k < 3 else None, surface_p95_mm=some(3.0, 5.0) if k < 3 else None,
             components=1, mesh_components=int(random.integers(1, 4)) * (k < 3),
@@ -74,7 +74,7 @@ def fake_run(seed, scale, order=1):
     seconds = {"lattice": some(0.1, 1.0), "optimise": some(1.0, 20.0)}
     measurement = Measurement(
         order=order, n_nodes=5000 + seed, n_corners=(5000 + seed) // (1, 7)[order - 1],
-        n_cells=27000 + 5 * seed, E_D=1e9 * scale, E_D_share=0.04 * scale, n_missed_voxels=0,
+        n_cells=27000 + 5 * seed, E_D=1e9 * scale, E_D_fraction=0.04 * scale, n_missed_voxels=0,
         n_empty_cells=0, quality=quality, rho_histogram=Histogram(np.linspace(0, 1 / 3, 21).tolist(), rho.tolist()),
         dihedral_histogram=Histogram(list(range(0, 181, 5)), angles.tolist()), labels=labels, fem=fem,
     )  # fmt: skip
@@ -139,7 +139,7 @@ def fake_report():
     return Report(
         command="tetopt compare T1.nii.gz -o out --nodes 5000",
         image=ImageFacts(source, (197, 233, 189), [1, 1, 1], 2841.2),
-        labels=LabelSource("labels.nii.gz", "given", "cd" * 32), law="1 kPa at 0, 10 kPa at 255",
+        labels=LabelSource("labels.nii.gz", "given", "cd" * 32), mapping="1 kPa at 0, 10 kPa at 255",
         versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine={"cores": 2, "system": "Linux"}, options=Settings(5000),
         reference=ReferenceGrid(
             (49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234, OwnError(0.01, 0.02), 17)}
@@ -220,7 +220,7 @@ def claims(page):
 
 # Where report.json holds what a row shows, written down here once more.
 PATHS = {
-    ("Image", "E_D, share of the image's variance"): ("E_D_share",),
+    ("Image", "E_D, fraction of the image's variance"): ("E_D_fraction",),
     ("Image", "voxels outside the mesh"): ("n_missed_voxels",),
     ("Cost", "nodes"): ("n_nodes",),
     ("Cost", "tetrahedra"): ("n_cells",),
@@ -285,7 +285,7 @@ DERIVED = {
     ),
     (JUDGED, "label edges in more than two facets"): lambda rows: sum(r.nonmanifold_edges for r in rows[1:3]),
     (JUDGED, "of these, where two labels meet"): lambda rows: sum(r.nonmanifold_edges_two_labels for r in rows[1:3]),
-    (JUDGED, "labels in more or fewer pieces"): lambda rows: sum(r.mesh_components != 1 for r in rows[1:3]),
+    (JUDGED, "labels with more or fewer components"): lambda rows: sum(r.mesh_components != 1 for r in rows[1:3]),
     (JUDGED, "labels lost (of any size)"): lambda rows: 1,
 }
 
@@ -389,7 +389,7 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
 
 
 def folded_tables(parsed):
-    """Of the labels' pieces, and of their shares of E_D."""
+    """Of the labels' connected components, and of their fractions of E_D."""
     return [
         table
         for table in parsed.tables
@@ -436,12 +436,12 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
             assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
-    pieces, shares = folded_tables(parsed)
+    pieces, fractions = folded_tables(parsed)
     for k in range(4):
         for column, pipeline in enumerate(done, 2):
             of_runs = [run.measurement.labels[k] for run in pipeline.runs]
             assert float(pieces[k + 1][column][1][0]) == np.median([row.mesh_components for row in of_runs])
-            assert close(shares[k + 1][column][1][0], np.median([row.E_D_share for row in of_runs]))
+            assert close(fractions[k + 1][column][1][0], np.median([row.E_D_fraction for row in of_runs]))
 
 
 def test_most_of_many_labels_are_folded(tmp_path):
@@ -525,16 +525,16 @@ def test_winners(better, values, expected):
     assert winners(better, values) == expected
 
 
-def with_values(**shares):
-    """A report in which the named pipelines have these shares of E_D."""
+def with_values(**fractions):
+    """A report in which the named pipelines have these fractions of E_D."""
     report = fake_report()
     for number, pipeline in enumerate(report.pipelines):
-        if pipeline.name in shares:
-            with_measured(report, number, E_D_share=shares[pipeline.name])
+        if pipeline.name in fractions:
+            with_measured(report, number, E_D_fraction=fractions[pipeline.name])
     return report
 
 
-E_D_ROW = ("Image", "E_D, share of the image's variance")
+E_D_ROW = ("Image", "E_D, fraction of the image's variance")
 
 
 def test_a_loss_is_marked_and_said(tmp_path):
@@ -624,7 +624,7 @@ def test_what_is_behind_is_worst_first(tmp_path):
 def test_verdicts(tmp_path, ours, theirs, verdict):
     report = with_values(tetopt=ours)
     runs = [
-        run._replace(measurement=run.measurement._replace(E_D_share=value))
+        run._replace(measurement=run.measurement._replace(E_D_fraction=value))
         for run, value in zip(report.pipelines[1].runs, theirs, strict=True)
     ]
     report.pipelines[1] = with_runs(report.pipelines[1], runs)
@@ -803,7 +803,7 @@ def test_a_failed_repeat_is_named_beside_its_numbers(tmp_path):
     report.pipelines[1] = report.pipelines[1]._replace(failure="timed out after 3600 s", reason="limit")
     page = page_of(tmp_path, report)
     assert "pytetwild: a run failed: timed out after 3600 s." in page
-    assert measures(page)[E_D_ROW][1][1][0] == number_text(report.pipelines[1].median.measurement.E_D_share)
+    assert measures(page)[E_D_ROW][1][1][0] == number_text(report.pipelines[1].median.measurement.E_D_fraction)
 
 
 def test_without_labels_and_finite_elements(tmp_path):
@@ -822,7 +822,7 @@ def test_without_labels_and_finite_elements(tmp_path):
 
 def with_names(report, evil):
     return report._replace(
-        command=evil, law=evil, labels=report.labels._replace(name=evil, names={1: evil, 3: evil}),
+        command=evil, mapping=evil, labels=report.labels._replace(name=evil, names={1: evil, 3: evil}),
         options=report.options._replace(k_D=evil),
         image=report.image._replace(source=report.image.source._replace(name=evil)),
         pipelines=[p._replace(title=evil, about=evil, notes=[evil], failure=evil) for p in report.pipelines],
@@ -848,7 +848,7 @@ def test_names_are_escaped(tmp_path):
 def test_settings_are_shown(tmp_path):
     report = fake_report()
     page = page_of(tmp_path, report)
-    words = [report.command, "a note on tetopt", "197 × 233 × 189", "ab" * 32, report.law, "0.1.0", "435000"]
+    words = [report.command, "a note on tetopt", "197 × 233 × 189", "ab" * 32, report.mapping, "0.1.0", "435000"]
     for word in [*words, *(p.about for p in report.pipelines)]:
         assert html.escape(word) in page
 

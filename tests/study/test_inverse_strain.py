@@ -14,7 +14,7 @@ def test_inverse_strain():
     assert modulus.dtype == np.float64
 
 
-def test_inverse_strain_is_a_law():
+def test_inverse_strain_is_a_mapping():
     image = Image(np.array([[0.01, -0.02], [0.0, 0.5]]))
     modulus = young_image(image, lambda strain: inverse_strain(strain, 0.005)).data
     np.testing.assert_allclose(modulus, [[100.0, 50.0], [200.0, 2.0]], rtol=1e-14)

@@ -171,7 +171,7 @@ def test_fem_bad_input(block, options, words, capsys):
 
 
 def test_fem_averages(tmp_path, capsys):
-    """Without a law, too: of the intensities. Around Gauss points it is another one for quadratic cells."""
+    """Without a mapping, too: of the intensities. Around Gauss points it is another one for quadratic cells."""
     image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 9.0, (8, 8, 8)))
     tetopt.save_image(tmp_path / "i.nii", image)
     tetopt.save_mesh(tmp_path / "i.vtu", tetopt.lattice_mesh(image, blocks=(2, 2, 2)))
@@ -269,14 +269,14 @@ def test_fem_says_when_it_cannot_solve(tmp_path, capsys):
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])
 def test_simulate_is_the_compression_it_says(turn):
-    """Eq. (2): the mean of the law, not the law of the mean; the high face held, the low one pushed, by the height."""
+    """Eq. (2): the mean of the mapping, not of the mean intensity; the high face held, the low one pushed."""
     rng = np.random.default_rng(1)
     affine = np.diag([2.0, 1.0, 1.5, 1.0])
     c, s = np.cos(turn), np.sin(turn)
     affine = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]) @ affine
     image = tetopt.Image(rng.uniform(1.0, 5.0, (6, 9, 8)), affine)
     mesh = tetopt.lattice_mesh(image, nodes=60)
-    simulated, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, law=lambda h: h**2)
+    simulated, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, mapping=lambda h: h**2)
     owner = tetopt.cell_of_voxel(image, mesh)
     means = [(image.data[owner == cell] ** 2).mean() for cell in range(len(mesh.cells)) if (owner == cell).any()]
     np.testing.assert_allclose(

@@ -216,7 +216,7 @@ def test_programs_in_the_comparison(tmp_path, opengl):
     assert report["versions"]["mine, SHA-256 of its files"].split(", ")[-1] == sha256(Path(shlex.split(MESHER)[0]))
     assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [True] * 3
     assert set(mine["median"]["fem"]) == set(bcc["median"]["fem"]) == {"0.3", "0.45"}
-    assert mine["median"]["E_D_share"] == pytest.approx(bcc["median"]["E_D_share"], rel=0.1)
+    assert mine["median"]["E_D_fraction"] == pytest.approx(bcc["median"]["E_D_fraction"], rel=0.1)
     assert other["median"]["fem"] == {}
     assert "of its boundary facets lie off" in other["median"]["not_compressed"]
     assert 0.0 < other["median"]["labels"][0]["dice"] < 1.0

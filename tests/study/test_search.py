@@ -13,7 +13,7 @@ from tetopt.study.tetwild import TETWILD_RESPONSE
         (REQUEST_RESPONSE, 1.0, 130), (REQUEST_RESPONSE, 0.7, 4000), (REQUEST_RESPONSE, 2.0, 900),
     ],
 )  # fmt: skip
-def test_power_laws(response, power, first):
+def test_power_mappings(response, power, first):
     """On a power law the second step is exact; the requested 1000 are reached in a few steps, the nearest run first."""
     factors = []
 

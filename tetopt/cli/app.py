@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 import tetopt
 from tetopt.cli.console import log, open_streams, out, settle_streams, show_error, show_event, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
-from tetopt.errors import InputError, error_words
+from tetopt.errors import FORMER_NAMES, InputError, error_words
 from tetopt.job.events import listened
 from tetopt.system.budget import check_addresses
 from tetopt.system.files import Outputs, outputs_of_command
@@ -72,7 +72,7 @@ class _Group(_Plain, TyperGroup):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit code.
 
-    0: done; 1: a promise of the mesh is missed; 2: an input to mend, or an output that could not be written, standard
+    0: done; 1: the mesh violates a requirement; 2: an input to mend, or an output that could not be written, standard
     output among them; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
     """
     open_streams()
@@ -104,6 +104,9 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     except Exception as error:
         if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
             raise
+        former = FORMER_NAMES.get(getattr(error, "option_name", "").strip("-").replace("-", "_"))
+        if former is not None:
+            error.possibilities = ["--" + former.replace("_", "-")]  # type: ignore[attr-defined]
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
         return 2

@@ -121,7 +121,12 @@ class _CohortDisplay:
         counts = Counter[str](row.status for row in own)
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
             log.print(escape(f"{row.key}: {row.reason}"))
-        words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "missing": "not run"}
+        words = {
+            "done": "done",
+            "violated": "done, but violates a requirement",
+            "failed": "failed",
+            "missing": "not run",
+        }
         parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
         out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):

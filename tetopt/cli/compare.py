@@ -32,7 +32,7 @@ from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import table_of_labels
-from tetopt.model.laws import parse_law
+from tetopt.model.mappings import parse_mapping
 from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_criteria import number_text
 from tetopt.study.compare_headline import Headline, headline
@@ -83,7 +83,7 @@ class SimulationOptions:
 
     panel: ClassVar[str] = "The simulation"
     young: Annotated[
-        str | None, option("LAW", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
+        str | None, option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
     ] = None
     average: AverageOption = DEFAULT_SETTINGS.average
     reference_seconds: Annotated[
@@ -195,10 +195,10 @@ def compare_command(
     settings = _settings(compared, simulation, limits)
     part, labels_path, young = compared.part, compared.labels, simulation.young
     image, labels = _image_and_labels(image_path, labels_path, part)
-    law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
+    mapping, mapping_words = compare.default_mapping(image) if young is None else (parse_mapping(young), young)
     comparison = compare.Comparison(
-        image, labels, law, settings, ImageSource(image_path.name, sha256(image_path), part.volume, part.crop),
-        _label_source(labels_path, labels, compared.label_names), law_words,
+        image, labels, mapping, settings, ImageSource(image_path.name, sha256(image_path), part.volume, part.crop),
+        _label_source(labels_path, labels, compared.label_names), mapping_words,
         command=f"tetopt {' '.join(map(shlex.quote, context.obj))}",
     )  # fmt: skip
     paths = checked_outputs(results_folder(output), compare_files.COMPARE_FILES, force or resume)

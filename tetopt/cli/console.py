@@ -29,7 +29,7 @@ PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls
             "retessellate", "gradation", "boundary", "iterations", "nodes", "weights",
         )
     },
-    "smallest": "--size-min", "largest": "--size-max", "longest": "--edge-max", "field": "--sizing",
+    "smallest": "--size-min", "edge_size": "--edge-size", "longest": "--edge-max", "field": "--sizing",
 }  # fmt: skip
 PARAMETER_PATTERN = re.compile(rf"^(?:{'|'.join(PARAMETER_OPTIONS)})(?=:)")
 OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments that messages name
@@ -178,8 +178,8 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> N
     if "edges_over_target" in measured:
         out.print(escape(sizes_in_words(measured["edges_over_target"])))
     for row in measured.get("contrasts", []):
-        share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
-        out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
+        fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, fraction of its own variance in cells {fraction}"))
     if "mask" in measured:
         print_wide(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:

@@ -24,7 +24,7 @@ def convert_command(
         Path, typer.Argument(metavar="OUT", help=f"The file to write: {', '.join(FORMATS)}.", show_default=False)
     ],
     image_path: Annotated[
-        Path | None, option("IMAGE", "Take means and laws from this image, not from the mesh's file.", "--image")
+        Path | None, option("IMAGE", "Take means and mappings from this image, not from the mesh's file.", "--image")
     ] = None,
     mask_path: Annotated[Path | None, option("MASK", "With --image: only what lies in it counts.", "--mask")] = None,
     results_path: Annotated[

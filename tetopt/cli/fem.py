@@ -17,11 +17,11 @@ from tetopt.cli.options import NumberOptions, option
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions
 from tetopt.job.solve import PAPER_PERCENT, SolvedModel, solve_file
-from tetopt.model.laws import ByLabel, parse_any_law
+from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
 from tetopt.system.files import checked_output, save_json
 
-SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
+SHOWN_FRACTION = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 
 
 def fem_command(
@@ -29,7 +29,7 @@ def fem_command(
         list[Path],
         typer.Argument(
             metavar="[IMAGE] MESH",
-            help="VTU, VTK or MSH file; with moduli and loads it needs no more. Laws are of IMAGE's intensities.",
+            help="VTU, VTK or MSH file; with moduli and loads it needs no more. Mappings are of IMAGE's intensities.",
         ),
     ],
     compress: Annotated[
@@ -75,14 +75,14 @@ def fem_command(
 
 
 def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
-    """Rows that tell what the moduli are of: the law, how it was averaged, the ratios."""
+    """Rows that tell what the moduli are of: the mapping, how it was averaged, the ratios."""
     model, options, nu = came.model, came.options, came.numbers["materials"]["nu"]
-    yield "law of the modulus", "of the mesh's file" if options.young is None else escape(options.young)
+    yield "modulus mapping", "of the mesh's file" if options.young is None else escape(options.young)
     if model.node_young is not None:
         yield "modulus within a cell", "linear between its nodes"
     elif model.gauss_young is not None:
         yield "modulus within a cell", "one around each Gauss point"
-    elif options.average is not None and not isinstance(parse_any_law(str(options.young)), ByLabel):
+    elif options.average is not None and not isinstance(parse_any_mapping(str(options.young)), ByLabel):
         yield "average over a cell", options.average
     low, high = nu.min(), nu.max()
     yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
@@ -120,5 +120,5 @@ def _print(name: str, came: SolvedModel) -> None:
 
 def _vector(force: NDArray[np.float64]) -> str:
     """The components of a force; what is rounding beside the largest is 0."""
-    shown = np.where(np.abs(force) > SHOWN_SHARE * np.abs(force).max(), force, 0.0)
+    shown = np.where(np.abs(force) > SHOWN_FRACTION * np.abs(force).max(), force, 0.0)
     return ", ".join(f"{part:.6g}" for part in shown)

@@ -77,7 +77,7 @@ def _print_comparison(result: Result, n_empty: int) -> None:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         table.add_row(
-            f"E_D, share of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
+            f"E_D, fraction of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
         )
     meshes = (result.meshed.initial, result.mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []

@@ -24,8 +24,8 @@ def print_prediction(task: Task) -> None:
         f"{_seconds(seconds / factor)} to {_seconds(seconds * factor)}, if nothing else runs and the kernels are "
         "compiled"
     )
-    n_bytes, share = prediction.peak_bytes, model.bytes_share
-    out.print(f"{memory_words(n_bytes)} of memory at its peak, in nine of ten cases {share:.0%} less or more")
+    n_bytes, fraction = prediction.peak_bytes, model.bytes_fraction
+    out.print(f"{memory_words(n_bytes)} of memory at its peak, in nine of ten cases {fraction:.0%} less or more")
     if task.plan.job.target_error is not None:
         out.print(f"of {size.runs} runs with {size.n_nodes} nodes: how many an error takes shows only in the run")
     free = available_bytes()

@@ -61,15 +61,17 @@ def quality_command(
 def _checked_words(came: Judgement) -> str:
     """What a mesh that is sound was looked at for besides."""
     if came.is_masked:
-        return "; made within a mask, which may have pieces"
+        return "; made within a mask, which may have several components"
     return ", in one piece" + (", fills the box" if came.source is not None and came.is_filled else "")
 
 
 def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str]) -> None:
     """Rows of how well cells fit an image, without what the run that made the mesh had besides."""
     table.add_row("E_D", f"{fit.E_D:.6g}")
-    if fit.E_D_share_of_variance is not None:
+    if fit.E_D_fraction_of_variance is not None:
         words = f", without its {' and '.join(left_out)}" if left_out else ""
-        table.add_row(f"E_D, share of {whose_variance(source.content)}{words}", f"{fit.E_D_share_of_variance:.5f}")
+        table.add_row(
+            f"E_D, fraction of {whose_variance(source.content)}{words}", f"{fit.E_D_fraction_of_variance:.5f}"
+        )
     table.add_row("voxels inside", f"{fit.n_voxels} of {source.contrasts[0].data.size}")
     table.add_row("cells without a voxel", str(fit.n_empty_cells))

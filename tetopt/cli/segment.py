@@ -41,19 +41,22 @@ def segment_command(
     truth = None if truth_path is None else read_labels(truth_path, image, part)
     mesh = _mesh_over(mesh_path, image, image_path)
     labels = segment(image, mesh, classes)
-    shares = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
-    means = [float(image.data[labels.data == number].mean()) if share else None for number, share in enumerate(shares)]
+    fractions = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
+    means = [
+        float(image.data[labels.data == number].mean()) if fraction else None
+        for number, fraction in enumerate(fractions)
+    ]
     report: dict[str, Any] = {
-        "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "share_of_voxels": shares,
+        "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "fraction_of_voxels": fractions,
         "mean_intensity": means,
     }  # fmt: skip
     names = {} if truth is None else stands_for(labels, truth)  # of labels, by class
     table = new_table(
-        "class", "share of the voxels", "mean intensity", *([] if truth is None else ["stands for label"])
+        "class", "fraction of the voxels", "mean intensity", *([] if truth is None else ["stands for label"])
     )
-    for number, (share, mean) in enumerate(zip(shares, means, strict=True)):
+    for number, (fraction, mean) in enumerate(zip(fractions, means, strict=True)):
         last = [] if truth is None else [str(names.get(number, "none"))]
-        table.add_row(str(number), f"{share:.4f}", "" if mean is None else f"{mean:.4g}", *last)
+        table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
     overlaps = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
     if truth_path is not None and truth is not None:
         by_mesh, by_voxels = dice(labels, truth), dice(thresholded(image, classes), truth)

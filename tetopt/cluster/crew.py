@@ -20,13 +20,13 @@ WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and 
 # The same of one that runs tasks itself: 240 MB with all kernels loaded, its nanny, zarr and buffers of threads.
 WITHIN_BYTES = 4e8
 # Of its limit, at which a nanny ends a worker: 5 % are left for what is taken until it looks again, 0.1 s later.
-TERMINATE_SHARE = 0.95
+TERMINATE_FRACTION = 0.95
 # Dask's configuration of its own scheduler: a worker that dies fails its task at once.
 SCHEDULER_SETTINGS = {"distributed.scheduler.allowed-failures": 0}
 # Where workers run tasks themselves: these hold nothing that dask could put elsewhere, so that there is one limit, and
 # a process that is in a kernel, which lets no other thread of Python run, is not taken for dead.
 WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")} | {
-    "distributed.worker.memory.terminate": TERMINATE_SHARE,
+    "distributed.worker.memory.terminate": TERMINATE_FRACTION,
     "distributed.scheduler.worker-ttl": None,
 }
 DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
@@ -37,7 +37,7 @@ class Need(NamedTuple):
 
     n_tasks: int  # that are to be run
     task_bytes: float  # of the largest, predicted, 0 if nothing is known
-    threads: int | None  # for each task, None: its share of the cores
+    threads: int | None  # for each task, None: its part of the cores
     is_within: bool = False  # tasks are run by the workers themselves, in whose processes kernels stay loaded
     most_bytes: float | None = None  # of a worker of this machine, which its tasks share
 
@@ -48,12 +48,12 @@ class Need(NamedTuple):
     def limit_for(self, task_bytes: float) -> float:
         """Memory of a worker whose task may take so much, bytes."""
         if self.is_within:
-            return (task_bytes + WITHIN_BYTES) / TERMINATE_SHARE
+            return (task_bytes + WITHIN_BYTES) / TERMINATE_FRACTION
         return task_bytes + WORKER_BYTES
 
     def room_of(self, limit: float) -> float:
         """Memory for the task of a worker that has so much in all, bytes."""
-        return max(0.0, limit * TERMINATE_SHARE - WITHIN_BYTES if self.is_within else limit - WORKER_BYTES)
+        return max(0.0, limit * TERMINATE_FRACTION - WITHIN_BYTES if self.is_within else limit - WORKER_BYTES)
 
 
 class Folders(NamedTuple):

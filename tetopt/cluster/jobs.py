@@ -190,7 +190,7 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
 
 def _exports(need: Need, threads: int) -> tuple[str, ...]:
     """What workers are told by their environment; more where they run tasks themselves."""
-    names: dict[str, Any] = {SAFE_PATH_NAME: 1}  # a job begins in a folder that may hold a stranger's modules
+    names: dict[str, Any] = {SAFE_PATH_NAME: 1}  # a job begins in a folder that may hold untrusted modules
     if need.is_within:
         names |= {f"DASK_{key.upper().replace('.', '__')}": value for key, value in WITHIN_SETTINGS.items()}
         names[THREADS_NAME] = threads

@@ -50,7 +50,7 @@ from tetopt.system.files import checked_output
 NAMED_FAILURES = 20  # in words: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
 PAGE_SECONDS = 60.0  # between the table and page of a run under way and the next: nobody looks more often
-PAGE_SHARE = 0.05  # of the run's time that they may take
+PAGE_FRACTION = 0.05  # of the run's time that they may take
 
 
 class CohortPlan(NamedTuple):
@@ -102,8 +102,8 @@ def run_cohort(
     Returns
     -------
     dict
-        By subject, as "sub-01_ses-a", what there is now: "done", "missed" (a mesh that misses a requirement), "failed"
-        or "missing".
+        By subject, as "sub-01_ses-a", what there is now: "done", "violated" (a mesh that misses a requirement),
+        "failed" or "missing".
 
     Raises
     ------
@@ -177,7 +177,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
 def _tell_plan(plan: CohortPlan) -> None:
     """How many subjects there are of each kind, and why the ones are run that are there already."""
     counts = Counter[str](entry.state.status for entry in plan.entries)
-    words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "changed": "changed"}
+    words = {"done": "done", "violated": "done, but violates a requirement", "failed": "failed", "changed": "changed"}
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
     parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
     note(f"{counted(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run")
@@ -202,7 +202,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
         # Once more: another run may have ended since.
         to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
-            if entry.state.status in ("done", "missed"):  # what failed since was of other options or inputs
+            if entry.state.status in ("done", "violated"):  # what failed since was of other options or inputs
                 failure_path(place, entry.key).unlink(missing_ok=True)
         try:
             if to_run:
@@ -253,7 +253,7 @@ def _refresher(place: Path) -> Callable[[], None]:
     def refresh() -> None:
         nonlocal last, spent
         begun = time.monotonic()
-        if begun - last > max(PAGE_SECONDS, spent / PAGE_SHARE):
+        if begun - last > max(PAGE_SECONDS, spent / PAGE_FRACTION):
             save_cohort_files(place, collect(place))
             last = time.monotonic()
             spent = last - begun
@@ -279,7 +279,9 @@ def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], No
         left.pop(ended.key, None)
         rest = sum(left.values())
         seconds_left = (time.monotonic() - begun) * rest / max(total - rest, 1.0) if left else None
-        what = {"done": "done", "missed": f"a promise is missed: {ended.reason}"}.get(ended.status, ended.reason)
+        what = {"done": "done", "violated": f"a requirement is violated: {ended.reason}"}.get(
+            ended.status, ended.reason
+        )
         memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
         at = CohortProgress(ended, len(jobs) - len(left), len(jobs), n_failed, seconds_left)
         progress(f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})", at)

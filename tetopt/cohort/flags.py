@@ -1,4 +1,4 @@
-"""What is odd about a subject beside the others: missed promises, lost labels, another grid, numbers far off."""
+"""What is odd about a subject beside the others: violated requirements, lost labels, another grid, numbers far off."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ FAR_DEVIATIONS = 5.0
 # (`tests/cohort/test_flags.py`): normal numbers are flagged in at most 1 case of 1000 at every n from 8 on.
 FEW_SUBJECTS = 8  # with fewer, nothing is said of numbers; also the 8 above
 MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
-MAJORITY_SHARE = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
-COMMON_SHARE = 0.9  # of subjects that have what is missed in the others: in fewer it is a matter of choice
+MAJORITY_FRACTION = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
+COMMON_FRACTION = 0.9  # of subjects that have what the others lack: in fewer it is a matter of choice
 LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of one size, in one place, differ by as much
 # Of correlations, by which a picture is more like the others' turned over: those of a symmetric head, meshed anew, lie
 # within 0.001 on either side, those of heads with back and front exchanged at 0.01 (whole) to 0.12 (brains).
 TURN_MARGIN = 0.005
 # Turned over, the others' median would be about as far on the other side of 0; what is cut off is at a fifth of that.
-TURN_SHARE = 1 / 3
+TURN_FRACTION = 1 / 3
 SIDED_DEVIATIONS = 1.5  # by which the others' median is below 0: normal numbers are there in 9 of 10 at least
 TURN_DEVIATIONS = 2.5  # beyond the median: 6 of 1000 normal numbers, most of which are below the margin
 SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many zeros behind the point
@@ -36,7 +36,7 @@ Side = Literal["both", "above", "below"]
 class Flag(NamedTuple):
     """One odd thing about a subject."""
 
-    column: str  # of `tetopt.cohort.numbers`, or "missed", "label", "duplicate"
+    column: str  # of `tetopt.cohort.numbers`, or "violated", "label", "duplicate"
     words: str  # the reason, on one line
     score: float  # robust deviations; inf for what is odd without measuring
 
@@ -55,7 +55,7 @@ class Quantity(NamedTuple):
 # The least scales are differences that nobody would look at an image for: 5 % of a volume, 1 degree, 0.002 of rho.
 QUANTITIES = (
     Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, LEAST_LIKENESS),
-    Quantity("energies.E_D_share_of_variance", "E_D's share of the variance", "", "both", True, 0.05),
+    Quantity("energies.E_D_fraction_of_variance", "E_D's fraction of the variance", "", "both", True, 0.05),
     Quantity("quality.mean_rho", "mean rho", "", "both", False, 0.002),
     Quantity("quality.min_dihedral", "smallest angle", "degrees", "below", False, 1.0),
     Quantity("grid.volume_mm", "volume of the image", "mm", "both", True, 0.05),
@@ -87,8 +87,8 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     Returns
     -------
     list of list of Flag
-        Of each row: promises that its mesh misses; labels that no cell carries, and labels that 9 of 10 others have
-        and its image has not, or the other way round; an image that another subject has, too; another orientation,
+        Of each row: requirements that its mesh violates; labels that no cell carries, and labels that 9 of 10 others
+        have and its image has not, or the other way round; an image that another subject has, too; another orientation,
         spacing or shape than two thirds have; of 8 or more subjects, a picture that is clearly more like the others'
         turned over, and numbers more than `limit` robust deviations from the median. 2-D and 3-D meshes are compared
         each with their like.
@@ -97,7 +97,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     for ndim, places in _groups(rows).items():
         own = [rows[place] for place in places]
         names = {number: name for row in reversed(own) for number, name in row.label_names.items()}
-        for flagged_by in (_promises, _lost, _absent, _doubled, _grids, _turned):
+        for flagged_by in (_violations, _lost, _absent, _doubled, _grids, _turned):
             for place, flag in flagged_by(own, names):
                 flags[places[place]].append(flag)
         dimension = 2 if ndim == 2 else 3
@@ -136,7 +136,7 @@ def _groups(rows: Sequence[Row]) -> dict[Value, list[int]]:
     """Places of the rows that have a mesh, by its dimension."""
     groups: dict[Value, list[int]] = defaultdict(list)
     for place, row in enumerate(rows):
-        if row.status in ("done", "missed"):
+        if row.status in ("done", "violated"):
             groups[row.numbers.get("quality.ndim")].append(place)
     return groups
 
@@ -150,17 +150,17 @@ def _is_mixed(texts: Sequence[Value]) -> bool:
     if len(set(texts)) < 2:
         return False
     count = Counter(texts).most_common(1)[0][1]
-    return len(texts) < 3 or count < MAJORITY_SHARE * len(texts) - FLOAT_ROUNDING
+    return len(texts) < 3 or count < MAJORITY_FRACTION * len(texts) - FLOAT_ROUNDING
 
 
 Flagged = Iterator[tuple[int, Flag]]
 
 
-def _promises(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
+def _violations(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     for place, row in enumerate(rows):
-        for name in row.missed:
+        for name in row.violated:
             if not (name == "labels" and row.n_lost):
-                yield place, Flag("missed", f"missed {name}", np.inf)
+                yield place, Flag("violated", f"violated {name}", np.inf)
 
 
 def _lost(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
@@ -177,11 +177,11 @@ def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     for number, count in counts.items():
         words = label_words(number, names)
         beside = f"{count} of {len(labelled)} have it"
-        if COMMON_SHARE * len(labelled) <= count < len(labelled):
+        if COMMON_FRACTION * len(labelled) <= count < len(labelled):
             for place in labelled:
                 if number not in rows[place].volumes:
                     yield place, Flag("label", f"no label {words} in its image: {beside}", np.inf)
-        elif len(labelled) >= FEW_SUBJECTS and count <= (1.0 - COMMON_SHARE) * len(labelled) + FLOAT_ROUNDING:
+        elif len(labelled) >= FEW_SUBJECTS and count <= (1.0 - COMMON_FRACTION) * len(labelled) + FLOAT_ROUNDING:
             for place in labelled:
                 if number in rows[place].volumes:
                     yield place, Flag("label", f"label {words} in its image: {beside}", np.inf)
@@ -224,13 +224,13 @@ def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         places = [place for place, row in enumerate(rows) if present([row.numbers.get(column)])]
         values = np.array(present(row.numbers.get(column) for row in rows))
         n_usual = int((values < 0.0).sum())
-        if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_SHARE * len(values) - FLOAT_ROUNDING:
+        if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_FRACTION * len(values) - FLOAT_ROUNDING:
             continue  # few, or no telling which of them are turned over
         middle = float(np.median(values))
         spread = MAD_OF_NORMAL * float(np.median(np.abs(values - middle)))
         if middle + SIDED_DEVIATIONS * spread > -TURN_MARGIN:
             continue  # of a shape that tells no sides apart
-        least = max(TURN_MARGIN, -TURN_SHARE * middle, middle + TURN_DEVIATIONS * spread)
+        least = max(TURN_MARGIN, -TURN_FRACTION * middle, middle + TURN_DEVIATIONS * spread)
         likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
         for k in np.flatnonzero(values >= least).tolist():
             if _is_like(rows[places[k]], values[k], likeness):

@@ -32,12 +32,12 @@ from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole
 from tetopt.system.incoming import toml_of
 
-Status = Literal["done", "missed", "failed", "missing"]
+Status = Literal["done", "violated", "failed", "missing"]
 Value = float | int | str | bool | None
 # Of run.json, not in the table: rows by iteration; sizes of sets, of which those of labels are in `labels`; names and
 # loads in words; what has columns by other names; the sentences that `reason` has.
 UNLISTED_NUMBERS = (
-    "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "missed",
+    "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "violated",
     "interfaces", "labels", "request",
 )  # fmt: skip
 SHORT_LIST = 4  # numbers of a list that have columns of their own: spacings, sides; more are moduli by the hundred
@@ -56,9 +56,10 @@ class Row(NamedTuple):
     key: str  # "sub-01_ses-a"
     subject: str  # "sub-01"
     session: str  # "ses-a", or ""
-    status: Status  # missed: a mesh, but a promise is missed; missing: expected, and neither a mesh nor a failure
-    reason: str  # what failed, or which promises are missed, on one line; "" for a subject that is done
-    missed: tuple[str, ...]  # the names of these promises
+    # violated: a mesh, but a requirement is violated; missing: expected, and neither a mesh nor a failure
+    status: Status
+    reason: str  # what failed, or which requirements are violated, on one line; "" for a subject that is done
+    violated: tuple[str, ...]  # the names of these requirements
     files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": paths relative to OUT, of those there
     numbers: dict[str, Value]  # by column
     label_names: dict[int, str]  # of its labels that have one
@@ -84,7 +85,7 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     """
     keys = {*_keys_there(out), *(expected or ())}
     rows = [row_of(out, key) for key in sorted(keys, key=natural_order)]
-    meshes = [row for row in rows if row.status in ("done", "missed")]
+    meshes = [row for row in rows if row.status in ("done", "violated")]
     names = [row.files.get("thumbnail") for row in meshes]
     for row, likeness in zip(meshes, likenesses([None if name is None else out / name for name in names]), strict=True):
         if likeness is not None:
@@ -143,19 +144,19 @@ def row_of(out: Path, key: str) -> Row:
 
 
 def _row_of_run(out: Path, row: Row, run: dict[str, Any]) -> Row:
-    """The row with the numbers of run.json, and what is missed."""
+    """The row with the numbers of run.json, and the requirements that are violated."""
     path = numbers_path(out, row.key)
     meshes = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json")
     mesh = min(meshes, default=None)
     if mesh is None:
         return row._replace(status="failed", reason="there are numbers and no mesh; run it again")
-    missed = run["missed"] if isinstance(run.get("missed"), dict) else {}
+    violated = run["violated"] if isinstance(run.get("violated"), dict) else {}
     labels = [each for each in _table(run, "labels") if isinstance(each.get("label"), int)]
     names = run["label_names"] if isinstance(run.get("label_names"), dict) else {}
     return row._replace(
-        status="missed" if missed else "done",
-        reason="; ".join(f"{plain(name)}: {plain(str(words))}" for name, words in missed.items()),
-        missed=tuple(plain(name) for name in missed),
+        status="violated" if violated else "done",
+        reason="; ".join(f"{plain(name)}: {plain(str(words))}" for name, words in violated.items()),
+        violated=tuple(plain(name) for name in violated),
         files={"mesh": mesh.relative_to(out).as_posix(), **row.files},
         numbers=flattened(run),
         label_names={int(number): plain(str(name)) for number, name in names.items() if number.isdecimal()},

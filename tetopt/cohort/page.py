@@ -37,18 +37,18 @@ PAGE_COLUMNS = {
     "size.n_nodes_in_all": "nodes", "quality.max_dihedral": "largest angle", "quality.n_under_10_degrees":
     "cells with angles under 10 degrees", "cells_without_voxel": "cells without a voxel", "energies.E": "E",
     "iterations_done": "iterations", "ended": "ended", "mask.distance_p95_mm": "distance to the mask, mm, 95 %",
-    "mask.components": "pieces of the mask", "mask.mesh_components": "pieces of the mesh",
+    "mask.components": "components of the mask", "mask.mesh_components": "components of the mesh",
     "memory.predicted_bytes": "memory predicted", "image": "image", "versions.tetopt": "version",
 }  # fmt: skip
 # Columns that are shown at first; those of the other quantities and of labels can be chosen.
 FIRST_COLUMNS = (
-    "grid.orientation", "energies.E_D_share_of_variance", "quality.mean_rho", "quality.min_dihedral", "mask.volume",
+    "grid.orientation", "energies.E_D_fraction_of_variance", "quality.mean_rho", "quality.min_dihedral", "mask.volume",
     "seconds.all", "memory.peak_bytes",
 )  # fmt: skip
 OPTION_BEGINNINGS = ("options.", "request.options.")  # of the columns of a run's options
 FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # by which the script knows what is there
 STATUS_WORDS: dict[Status, str] = {
-    "done": "done", "missed": "with a promise missed", "failed": "failed", "missing": "not run",
+    "done": "done", "violated": "with a violated requirement", "failed": "failed", "missing": "not run",
 }  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _counted(counts: Counter[Value]) -> str:
 
 def _options(rows: Sequence[Row]) -> dict[str, Counter[Value]]:
     """Version and options of the meshes: of each how many have which value; None where it is not stated."""
-    meshes = [row.numbers for row in rows if row.status in ("done", "missed")]
+    meshes = [row.numbers for row in rows if row.status in ("done", "violated")]
     stated = dict.fromkeys(name for numbers in meshes for name in numbers if name.startswith(OPTION_BEGINNINGS))
     counts = {name: Counter(numbers.get(name) for numbers in meshes) for name in ("versions.tetopt", *stated)}
     return {name: each for name, each in counts.items() if set(each) != {None}}
@@ -296,7 +296,8 @@ table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
 .subjects th button { text-align: inherit; color: inherit; } .subjects th:nth-child(2) { text-align: left; }
 .flag { color: #a33f00; } td.flag { font-weight: 600; } .bad { color: #b00020; }
 .badge { font-size: 0.78rem; padding: 0 0.4rem; border-radius: 0.7rem; background: #eee; white-space: nowrap; }
-.badge.failed, .badge.missing { background: #b00020; color: #fff; } .badge.missed { background: #d95f02; color: #fff; }
+.badge.failed, .badge.missing { background: #b00020; color: #fff; } .badge.violated { background: #d95f02; color: #fff;
+}
 .badge.done { background: #e3efe6; } .picture img { display: block; margin-top: 0.2rem; background: #000; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(256px, 1fr)); gap: 0.8rem; font-size: 0.85rem; }
 .tile { padding: 0.3rem; border: 1px solid #ddd; overflow-wrap: anywhere; } .tile.odd { border-color: #d95f02; }

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.state import SubjectState, state_of, strangers
+from tetopt.cohort.state import SubjectState, foreign_files, state_of
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
@@ -21,7 +21,7 @@ from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.job.texts import option_words, with_options
-from tetopt.model.laws import LAW_OPTIONS, law_file
+from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
 
 
 class PlannedSubject(NamedTuple):
@@ -95,8 +95,8 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
             problems.append((subject.place, str(error)))
             continue
         problems += [(subject.place, words) for words in _missing(plan.job)]
-        if (stranger := strangers(out, key(subject))) is not None:
-            problems.append(("", stranger))
+        if (foreign := foreign_files(out, key(subject))) is not None:
+            problems.append(("", foreign))
         entries.append(PlannedSubject(subject, key(subject), own, plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))
@@ -119,9 +119,9 @@ class _Plans:
     """Plans of subjects; options that several share are checked once."""
 
     def __init__(self, options: RunOptions, suffix: str) -> None:
-        laws = {name: law_file(getattr(options, name) or "") for name in LAW_OPTIONS}
+        mappings = {name: mapping_file(getattr(options, name) or "") for name in MAPPED_OPTIONS}
         # A worker may be started in another folder.
-        placed: dict[str, Any] = {name: str(file.absolute()) for name, file in laws.items() if file is not None}
+        placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
         self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")
         self._patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
         self._known: dict[Any, tuple[RunOptions, Plan]] = {}

@@ -52,7 +52,7 @@ class Ended(NamedTuple):
     """How a subject's run ended."""
 
     key: str
-    status: Literal["done", "missed", "failed", "given up"]
+    status: Literal["done", "violated", "failed", "given up"]
     reason: str  # one line; empty if all went well
     seconds: float
     peak_bytes: int  # of resident memory
@@ -114,8 +114,10 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
         text = log.read_text(encoding="utf-8", errors="replace")
         save_text(log, text.replace(str(work), str(subject_folder(out, job.key))))  # where its files are by now
         failure_path(out, job.key).unlink(missing_ok=True)
-        missed = "; ".join((numbers.get("missed") or {}).values())
-        return Ended(job.key, "missed" if missed else "done", missed, seconds, numbers["memory"]["peak_bytes"]), False
+        violated = "; ".join((numbers.get("violated") or {}).values())
+        return Ended(
+            job.key, "violated" if violated else "done", violated, seconds, numbers["memory"]["peak_bytes"]
+        ), False
     shutil.rmtree(work, ignore_errors=True)
     words = signal_words(child.returncode)
     reason = _reason(log, child.returncode) if words is None else f"ended by {words}"

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 from tetopt.cohort.layout import failure_path, mesh_name, not_our_files, numbers_of, numbers_path, subject_folder
 from tetopt.cohort.subjects import IMAGE_PATTERN
 
-Status = Literal["done", "missed", "failed", "changed", "missing"]  # "missed": a mesh that misses a promise
+Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": a mesh that violates a requirement
 WORDS_LISTED = 4  # of what has changed: a line's worth
 
 
@@ -38,7 +38,7 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     is_there = numbers is not None and mesh.is_file() and mesh.stat().st_size > 0
     if is_there and numbers is not None and (request is None or before.get("sha256") == request["sha256"]):
         return SubjectState(
-            "missed" if numbers.get("missed") else "done", "; ".join((numbers.get("missed") or {}).values())
+            "violated" if numbers.get("violated") else "done", "; ".join((numbers.get("violated") or {}).values())
         )
     if failure is not None:
         return SubjectState("failed", str(failure.get("reason", "")))
@@ -70,7 +70,7 @@ def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
     return "; ".join(words[:WORDS_LISTED]) + more
 
 
-def strangers(out: Path, key: str) -> str | None:
+def foreign_files(out: Path, key: str) -> str | None:
     """What is wrong with what lies in a subject's place, if that is no subject's of ours."""
     place = subject_folder(out, key)
     if not place.exists():

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.model.laws import LAW_OPTIONS, law_file
+from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
 
@@ -88,7 +88,7 @@ def read_table(path: Path) -> list[Subject]:
             continue
         options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
         files = {name: _absolute(folder, options.pop(name)) for name in FILE_OPTIONS if name in options}
-        options |= {name: str(_absolute(folder, str(file))) for name, file in _law_files(options)}
+        options |= {name: str(_absolute(folder, str(file))) for name, file in _mapping_files(options)}
         subjects.append(
             Subject(
                 cells["subject"].removeprefix("sub-"), cells.get("session", "").removeprefix("ses-"),
@@ -139,7 +139,7 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
     writer.writeheader()
     for each in subjects:
         row = {"subject": each.subject, **({"session": each.session} if each.session else {}), **each.options}
-        row |= {name: _relative(folder, file) for name, file in _law_files(each.options)}
+        row |= {name: _relative(folder, file) for name, file in _mapping_files(each.options)}
         row |= {name: _relative(folder, image) for name, image in zip(images, each.images, strict=False)}
         writer.writerow(row | {name: _relative(folder, file) for name, file in each.files.items()})
     return stream.getvalue()
@@ -162,8 +162,8 @@ def matching(pattern: str, subject: Subject) -> Path:
         No file matches, or several do.
     """
     words = pattern
-    if strange := [name for name in re.findall(r"\{[a-z_]+\}", pattern) if name not in ("{subject}", "{session}")]:
-        raise InputError(f"{pattern}: there is no {strange[0]}; write {{subject}} and {{session}}")
+    if unknown := [name for name in re.findall(r"\{[a-z_]+\}", pattern) if name not in ("{subject}", "{session}")]:
+        raise InputError(f"{pattern}: there is no {unknown[0]}; write {{subject}} and {{session}}")
     if not subject.session:
         words = re.sub(r"_ses-\{session\}|ses-\{session\}[_/]?", "", words)
     words = words.replace("{subject}", label_of(subject.subject)).replace("{session}", label_of(subject.session))
@@ -211,10 +211,10 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
     return columns
 
 
-def _law_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
-    """The files that laws among a subject's options name."""
-    for name in LAW_OPTIONS:
-        if (file := law_file(options.get(name, ""))) is not None:
+def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
+    """The files that mappings among a subject's options name."""
+    for name in MAPPED_OPTIONS:
+        if (file := mapping_file(options.get(name, ""))) is not None:
             yield name, file
 
 

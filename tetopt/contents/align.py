@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.domain import INSIDE_SHARE
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
@@ -20,11 +20,11 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
-LEAST_COVERED_SHARE = 0.5  # of the image's voxel centres, that a further contrast has to cover
+LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, that a further contrast has to cover
 BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median: what still counts as background
 MAD_TO_SIGMA = 1.4826  # of a normal distribution: its sigma over its median absolute deviation
-SMALL_PIECE_SHARE = 0.01  # of the largest piece's voxels: pieces with fewer do not count
-LEAST_CLASS_SHARE = 0.001  # of the voxels: a background or foreground with fewer, found without a level, is none
+SMALL_COMPONENT_FRACTION = 0.01  # of the largest piece's voxels: pieces with fewer do not count
+LEAST_CLASS_FRACTION = 0.001  # of the voxels: a background or foreground with fewer, found without a level, is none
 
 
 def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
@@ -61,7 +61,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     _check_axes(name, mask, image)
     inside = _mask_values(name, mask.data)
     moved = _moved(Image(inside, mask.affine), image)
-    if not (moved >= INSIDE_SHARE).any():
+    if not (moved >= INSIDE_FRACTION).any():
         raise InputError(f"{name}: nothing of the mask lies in the image's box; {_both_boxes(mask, image)}")
     return Image(moved, image.affine)
 
@@ -150,10 +150,10 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     _check_axes(name, other, image)
     if is_same_grid(other, image):
         return Image(other.data, image.affine)
-    share = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
-    if share < LEAST_COVERED_SHARE:
+    fraction = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
+    if fraction < LEAST_COVERED_FRACTION:
         raise InputError(
-            f"{name}: expected to cover half of the image's voxels or more, got {100 * share:.1f} %; "
+            f"{name}: expected to cover half of the image's voxels or more, got {100 * fraction:.1f} %; "
             f"{_both_boxes(other, image)}"
         )
     return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
@@ -191,19 +191,19 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
     >>> int(mask.data.sum())  # voxels
     504
     >>> result = tetopt.mesh_image(tetopt.content(image, mask=mask), 200, iterations=4)
-    >>> dict(result.missed)
+    >>> dict(result.violated)
     {}
     """
     limit = background_level(image) if level is None else float(level)
     is_outside = _large_pieces(image.data <= limit, at_border=True)
     is_inside = _large_pieces(~is_outside)
-    share, least = float(is_inside.mean()), LEAST_CLASS_SHARE if level is None else 0.0
-    if least < share < 1.0 - least:
+    fraction, least = float(is_inside.mean()), LEAST_CLASS_FRACTION if level is None else 0.0
+    if least < fraction < 1.0 - least:
         return Image(is_inside, image.affine)
     if level is None:
-        raise _no_background(f"{100 * share:.4g} % of the voxels would be foreground at level {limit:.4g}")
+        raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = float(image.data.min()), float(image.data.max())
-    outcome = "every voxel is foreground" if share > 0.5 else "nothing is left"
+    outcome = "every voxel is foreground" if fraction > 0.5 else "nothing is left"
     raise InputError(
         f"`background` {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
         f"holds {low:g} to {high:g}"
@@ -269,9 +269,9 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
             f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
             f"{values[0]:g} to {values[-1]:g} ({some}); write the one that you mean as 0 and 1 first"
         )
-    if top < INSIDE_SHARE:
+    if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
-        raise InputError(f"{name}: the mask is empty, expected voxels of {INSIDE_SHARE} or more, got {largest}")
+        raise InputError(f"{name}: the mask is empty, expected voxels of {INSIDE_FRACTION} or more, got {largest}")
     return data.astype(np.float32)
 
 
@@ -332,4 +332,4 @@ def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[
         is_inner = np.ones(len(sizes), dtype=np.bool_)
         is_inner[_on_faces(pieces)] = False
         sizes[is_inner] = 0
-    return (sizes >= max(1.0, SMALL_PIECE_SHARE * sizes.max()))[pieces]
+    return (sizes >= max(1.0, SMALL_COMPONENT_FRACTION * sizes.max()))[pieces]

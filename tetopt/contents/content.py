@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.domain import INSIDE_SHARE, Region, region_of
+from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
 from tetopt.contents.labels import check_labels, label_channels
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
@@ -23,7 +23,7 @@ from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
 
-RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
+RARITY_POWER = 0.5  # of a label's fraction of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
 STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
 WEIGHT_RANGE = 1e-3, 1e3  # the least and the largest weight, besides 0
@@ -322,7 +322,7 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     InputError
         Nothing inside the mask.
     """
-    inside = mask.data >= INSIDE_SHARE
+    inside = mask.data >= INSIDE_FRACTION
     if not inside.any():
         raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
     box = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
@@ -398,16 +398,16 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
 
     Each label has its value in one channel and 0 in the others. Labels that come nowhere near one another share a
-    channel. By voxel a label counts by its share of the voxels to the power -`RARITY_POWER`, so that small ones are
+    channel. By voxel a label counts by its fraction of the voxels to the power -`RARITY_POWER`, so that small ones are
     not given up for the surfaces of large ones; the variance of all is 1.
     """
     counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
     present = np.flatnonzero(counts)
     row = np.zeros(len(counts), dtype=np.int64)
     row[present] = np.arange(len(present))
-    number, share = row[labels], counts[present] / counts.sum()
-    size = share ** (-0.5 * RARITY_POWER)
-    channel = label_channels(number, len(share))
+    number, fraction = row[labels], counts[present] / counts.sum()
+    size = fraction ** (-0.5 * RARITY_POWER)
+    channel = label_channels(number, len(fraction))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
-    spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
-    return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
+    spread = float((codes**2 @ fraction - (codes @ fraction) ** 2).sum())
+    return number, (codes / np.sqrt(spread) if len(fraction) > 1 else codes[:0])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tetopt.image import Image
 
-INSIDE_SHARE = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
+INSIDE_FRACTION = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
 SMOOTHING_VOXELS = 1.0  # sigma of the Gaussian that takes the stairs of voxels off the surface
 MOST_SMOOTHED_VOXELS = 0.35  # the furthest that smoothing moves the surface
 ON_SURFACE_VOXELS = 1e-3  # a place with a level as near to 0 lies on the surface
@@ -35,7 +35,7 @@ def region_of(mask: Image) -> Region:
     fractions has its own surface between the voxels, and keeps it.
     """
     data = mask.data.astype(np.float64)
-    inside = data >= INSIDE_SHARE
+    inside = data >= INSIDE_FRACTION
     if inside.all():
         return Region(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
     within, without = scipy.ndimage.distance_transform_edt(inside), scipy.ndimage.distance_transform_edt(~inside)

@@ -170,11 +170,11 @@ def _level(
     low, high = _bounds(level, off)
     thin, broad = THIN_REACH
     reach = np.minimum(scipy.ndimage.maximum_filter(within, 13), scipy.ndimage.maximum_filter(without, 13))
-    share = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
+    fraction = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
     for _ in range(FLOW_STEPS):
         smooth = _flowed(level, FINE_SIGMA)
-        if share.any():
-            smooth += share * (_flowed(level, BROAD_SIGMA) - smooth)
+        if fraction.any():
+            smooth += fraction * (_flowed(level, BROAD_SIGMA) - smooth)
         level = np.clip(_with_volume(smooth, raw, max(VOLUME_SIGMA, *factors)), low, high)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 
@@ -270,10 +270,10 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
             n = data.shape[axis]
             at = np.clip(finer_index(n, factor), 0.0, n - 1.0)
             below = np.minimum(at.astype(np.int64), max(n - 2, 0))
-            share = (at - below).astype(data.dtype).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
+            fraction = (at - below).astype(data.dtype).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
             above = np.minimum(below + 1, n - 1)
             low = np.take(data, below, axis)
-            data = low + (np.take(data, above, axis) - low) * share
+            data = low + (np.take(data, above, axis) - low) * fraction
     return data
 
 
@@ -361,11 +361,11 @@ def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Seq
 def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> NDArray[np.float32]:
     """How far from its outline a slice is at most where slice `k` is on the other side.
 
-    A piece that ends there, of depth D, is cut off at its depth d after the share t = sqrt(1 - (1 - d / D)^2) / 2 of
+    A piece that ends there, of depth D, is cut off at its depth d after the fraction t = sqrt(1 - (1 - d / D)^2) / 2 of
     the way: as half an ellipsoid that ends half way. Linear between -d and the other level, that is d (1 / t - 1).
     """
-    share = np.abs(level[k]) / deepest[k]
-    return deepest[k] * (2.0 * np.sqrt(share / (2.0 - share)) - share)
+    fraction = np.abs(level[k]) / deepest[k]
+    return deepest[k] * (2.0 * np.sqrt(fraction / (2.0 - fraction)) - fraction)
 
 
 def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 
 HISTOGRAM_BINS = 256  # of the histogram whose classes are found: as many as 8-bit images have values
-TAIL_SHARE = 0.0005  # of the weight at either end, which may be some voxels far brighter than all others
+TAIL_FRACTION = 0.0005  # of the weight at either end, which may be some voxels far brighter than all others
 FEWEST_BINS = 64  # that all but the tails should spread over: with fewer, thresholds between classes are too coarse
 
 
@@ -76,13 +76,13 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
             "all of them have"
         )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
-    share = np.cumsum(counts) / counts.sum()
-    first, last = np.searchsorted(share, [TAIL_SHARE, 1.0 - TAIL_SHARE])
+    fraction = np.cumsum(counts) / counts.sum()
+    first, last = np.searchsorted(fraction, [TAIL_FRACTION, 1.0 - TAIL_FRACTION])
     if last - first + 1 >= FEWEST_BINS:
         return counts, edges
     order = np.argsort(values)
-    share = np.cumsum(np.ones(len(values)) if weights is None else weights[order])
-    ends = np.searchsorted(share, share[-1] * np.array([TAIL_SHARE, 1.0 - TAIL_SHARE]))
+    fraction = np.cumsum(np.ones(len(values)) if weights is None else weights[order])
+    ends = np.searchsorted(fraction, fraction[-1] * np.array([TAIL_FRACTION, 1.0 - TAIL_FRACTION]))
     low, high = values[order[np.minimum(ends, len(values) - 1)]]
     if not low < high:
         return counts, edges

@@ -12,7 +12,7 @@ from tetopt.mesh import Mesh
 
 
 def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
-    """Each cell's share of E_D, (M,) float64, intensity^2 mm^n.
+    """Each cell's contribution to E_D, (M,) float64, intensity^2 mm^n.
 
     E_D = sum_j integral over cell j of (h - hbar_j)^2 with h constant on a voxel and each voxel counted whole in
     the cell that holds its centre, hbar_j the cell's mean. So E_D lies between 0 and the image's own variance

@@ -20,7 +20,7 @@ from tetopt.system.kernel_cache import njit
 
 
 def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Each cell's share of E_G, (M,) float64, mm^(n+2), for points (N, n) in mm and cells (M, n+1)."""
+    """Each cell's contribution to E_G, (M,) float64, mm^(n+2), for points (N, n) in mm and cells (M, n+1)."""
     n = points.shape[1]
     return volumes(points, cells) * squared_edges(points, cells).sum(axis=1) / ((n + 1) * (n + 2))
 
@@ -61,7 +61,7 @@ def E_G(points: Points, cells: Cells) -> float:
 def E_G_gradient(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Derivative of E_G by every node, connectivity fixed, (N, n) float64, mm^(n+1).
 
-    For an interior node it is 2 |Omega_i| / (n+1) (x_i - c_i), c_i the volume-weighted mean of the ring's
+    For an interior node it is 2 |Omega_i| / (n+1) (x_i - c_i), c_i the volume-weighted mean of the star's
     circumcentres; this form needs no circumcentre, holds on the boundary too, and is finite on flat cells.
     """
     n = points.shape[1]
@@ -69,19 +69,22 @@ def E_G_gradient(points: Points, cells: Cells) -> NDArray[np.float64]:
     corners = points[cells]
     differences = (n + 1) * (corners - corners.mean(axis=1, keepdims=True))  # sum over k of x_i - x_k
     v = volumes(points, cells)[:, None, None]
-    share = (volume_gradients(points, cells) * lengths + 2.0 * v * differences) / ((n + 1) * (n + 2))
-    return _summed_at_nodes(share, cells, len(points))
+    fraction = (volume_gradients(points, cells) * lengths + 2.0 * v * differences) / ((n + 1) * (n + 2))
+    return _summed_at_nodes(fraction, cells, len(points))
 
 
-def ring_volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
+def star_volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     """``|Omega_i|``, the volume of the cells around each node, (N,) float64, mm^n."""
     v = np.broadcast_to(volumes(points, cells)[:, None], cells.shape)
     return np.bincount(cells.ravel(), weights=v.ravel(), minlength=len(points)).astype(np.float64)
 
 
-def _summed_at_nodes(share: NDArray[np.float64], cells: Cells, n_nodes: int) -> NDArray[np.float64]:
+def _summed_at_nodes(fraction: NDArray[np.float64], cells: Cells, n_nodes: int) -> NDArray[np.float64]:
     """Sum over the cells of what each gives to its nodes: (M, n+1, n) -> (N, n), in cell order."""
-    axes = [np.bincount(cells.ravel(), weights=share[..., d].ravel(), minlength=n_nodes) for d in range(share.shape[2])]
+    axes = [
+        np.bincount(cells.ravel(), weights=fraction[..., d].ravel(), minlength=n_nodes)
+        for d in range(fraction.shape[2])
+    ]
     return np.stack(axes, axis=1)
 
 

@@ -38,7 +38,7 @@ from tetopt.system.kernels import (
 )
 
 # A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
-FLAT_SHARE = 1e-7
+FLAT_FRACTION = 1e-7
 CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # of a `Complex`: one row for each cell
 
 
@@ -70,8 +70,8 @@ class Objective(NamedTuple):
     n_channels: int
     power: float  # p of the shape energy
     is_graded: bool  # whether every cell's shape counts the same, whatever its size
-    floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
-    safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above the floor
+    angle_limit: float  # minus the cosine of the minimum dihedral angle; -1 for none
+    safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above that angle
     rounding: float  # a sum of squares up to this, over all cells, is only rounding
     wrong_side: float  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
     n_means: int  # the first channels, of which a cell has its mean; of the others it has what its label says
@@ -319,15 +319,15 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
     cell's own volume, all sizes cancel, and what is left is eta^p: the same for every cell of that shape, so that the
     shape term has no wish for any size and E_D alone says where cells are small.
 
-    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT_SHARE`, so a
-    cell that passes is positively oriented exactly.
+    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT_FRACTION`,
+    so a cell that passes is positively oriented exactly.
     """
     if n_corners == 3:
         u, v = difference(x, 1, 0), difference(x, 2, 0)
         w = minus(u, v)
         volume = 0.5 * cross(u, v)[0]
         S = u[1] * u[1] + u[2] * u[2] + v[1] * v[1] + v[2] * v[2] + w[1] * w[1] + w[2] * w[2]
-        if volume <= FLAT_SHARE * S:
+        if volume <= FLAT_FRACTION * S:
             return np.inf
         eta = S / (6.928203230275509 * volume)
         if is_graded:
@@ -353,7 +353,7 @@ def determinant_and_squares(x: NDArray) -> tuple:
 def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> float:
     """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
     volume = determinant / 6.0
-    if volume <= 0.0 or volume * volume <= FLAT_SHARE * FLAT_SHARE * S * S * S:
+    if volume <= 0.0 or volume * volume <= FLAT_FRACTION * FLAT_FRACTION * S * S * S:
         return np.inf
     if is_graded:
         cube = S * S * S / (432.0 * determinant * determinant)  # eta^3
@@ -447,11 +447,11 @@ def _face_normal(x: NDArray, k: int) -> tuple:
 
 
 @entry
-def cosine_up_to_floor(x: Floats2, objective: Objective) -> float:
-    """`worst_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
+def cosine_up_to_limit(x: Floats2, objective: Objective) -> float:
+    """`worst_cosine`, or just the limit for a tetrahedron that is far from it: most are, and this costs a tenth."""
     determinant, S = determinant_and_squares(x)
     if determinant > 0.0 and S * S * S <= objective.safe * determinant * determinant:
-        return objective.floor
+        return objective.angle_limit
     return worst_cosine(x)
 
 
@@ -523,7 +523,7 @@ def settle(x: Floats2, state: State, cell: int) -> None:
 
 @inlined
 def cell_energy(state: State, cell: int) -> float:
-    """A cell's share of E, Eq. (4)."""
+    """A cell's contribution to E, Eq. (4)."""
     objective = state.objective
     squares = image_energy(state.complex.sums, cell, state.complex.labels[cell], objective)
     return objective.geometry * state.complex.E_shape[cell] + objective.image * squares
@@ -586,10 +586,10 @@ def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
     return float(E_shape.sum()), float(cell_squares(state, n_means).sum())
 
 
-# Rings: the cells around each node.
+# Stars: the cells around each node.
 
 
-class NodeRings(NamedTuple):
+class NodeStars(NamedTuple):
     """The cells around each node, as compressed rows, and which of their facets are one and the same."""
 
     start: Ints1  # (N+1,)
@@ -598,23 +598,23 @@ class NodeRings(NamedTuple):
     twin: Ints2  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
 
 
-def node_rings(state: State) -> NodeRings:
-    """The rings of a complex as it stands."""
+def node_stars(state: State) -> NodeStars:
+    """The stars of a complex as it stands."""
     n_cells, n_corners = int(state.complex.n_cells[0]), state.complex.cells.shape[1]
     start = np.zeros(len(state.complex.ticks) + 1, dtype=np.int64)
     cells = np.empty(n_cells * n_corners, dtype=np.int64)
     corner = np.empty(n_cells * n_corners, dtype=np.int64)
     twin = np.empty((n_cells * n_corners, n_corners), dtype=np.int64)
-    _fill_rings(start, cells, corner, state.complex.cells, n_cells)
+    _fill_stars(start, cells, corner, state.complex.cells, n_cells)
     with few_threads(n_cells):
-        rings = NodeRings(start, cells, corner, twin)
+        stars = NodeStars(start, cells, corner, twin)
         n_chunks = (len(state.complex.ticks) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
-        run(_fill_twins, n_chunks, Twins(rings, state.complex.across))
-    return rings
+        run(_fill_twins, n_chunks, Twins(stars, state.complex.across))
+    return stars
 
 
 @entry
-def _fill_rings(start: Ints1, ring: Ints1, corner: Ints1, cells: Ints2, n_cells: int) -> None:
+def _fill_stars(start: Ints1, star: Ints1, corner: Ints1, cells: Ints2, n_cells: int) -> None:
     n = cells.shape[1]
     for c in range(n_cells):
         for k in range(n):
@@ -625,7 +625,7 @@ def _fill_rings(start: Ints1, ring: Ints1, corner: Ints1, cells: Ints2, n_cells:
     for c in range(n_cells):
         for k in range(n):
             node = cells[c, k]
-            ring[fill[node]] = c
+            star[fill[node]] = c
             corner[fill[node]] = k
             fill[node] += 1
 
@@ -633,28 +633,28 @@ def _fill_rings(start: Ints1, ring: Ints1, corner: Ints1, cells: Ints2, n_cells:
 class Twins(NamedTuple):
     """What their twins are filled in from."""
 
-    rings: NodeRings
+    stars: NodeStars
     across: Ints2  # as of the complex
 
 
 @unit
 def _fill_twins(work: Twins, chunk: int) -> None:
-    across, start, ring, corner, twin = (
+    across, start, star, corner, twin = (
         work.across,
-        work.rings.start,
-        work.rings.cells,
-        work.rings.corner,
-        work.rings.twin,
+        work.stars.start,
+        work.stars.cells,
+        work.stars.corner,
+        work.stars.twin,
     )
     n = across.shape[1]
     for node in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(start) - 1)):
         for r in range(start[node], start[node + 1]):
             for k in range(n):
                 twin[r, k] = -1
-                other = across[ring[r], k]
+                other = across[star[r], k]
                 if k == corner[r] or other < 0:
                     continue
                 s = start[node]
-                while ring[s] != other:
+                while star[s] != other:
                     s += 1
-                twin[r, k] = (s - start[node]) * n + facet_of(across, other, ring[r])
+                twin[r, k] = (s - start[node]) * n + facet_of(across, other, star[r])

@@ -22,7 +22,7 @@ BOUND_MARGIN = 1.5  # on what sizes take: above the peaks of all runs that were 
 # Of a part's box: its values as stored and as an image's, their sums, and a field of doubles besides. 32 were measured
 # of doubles, 28 of single precision, 20 of whole numbers of 16 bits (parts of 8 to 27 million voxels).
 PART_VOXEL_BYTES = 34.0
-NEXT_SHARE = 0.3  # of what cells take: what an exchange or the end of a run takes besides
+NEXT_FRACTION = 0.3  # of what cells take: what an exchange or the end of a run takes besides
 CELLS_PER_NODE = {2: 2, 3: 6}  # of large meshes, by dimension
 
 
@@ -58,10 +58,10 @@ class CostModel(NamedTuple):
 
     seconds: dict[str, float]  # by term
     bytes: dict[str, float]  # by term
-    parallel_share: float  # of the sweeps' seconds, that threads divide among them
+    parallel_fraction: float  # of the sweeps' seconds, that threads divide among them
     calibration_seconds: float  # of `calibration` on the machine of the fit
     seconds_factor: float  # within which nine of ten runs left out of the fit lay
-    bytes_share: float  # likewise, of the measured
+    bytes_fraction: float  # likewise, of the measured
 
 
 @cache
@@ -69,8 +69,9 @@ def cost_model(path: Path = MODEL_FILE) -> CostModel:
     """The costs in a file, by default those that this version comes with."""
     table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     return CostModel(
-        table["seconds"], table["bytes"], table["threads"]["parallel_share"], table["machine"]["calibration_seconds"],
-        table["errors"]["seconds_factor"], table["errors"]["bytes_share"],
+        table["seconds"], table["bytes"], table["threads"]["parallel_fraction"],
+        table["machine"]["calibration_seconds"],
+        table["errors"]["seconds_factor"], table["errors"]["bytes_fraction"],
     )  # fmt: skip
 
 
@@ -90,8 +91,8 @@ def predicted(size: RunSize, threads: int = 1, speed: float = 1.0) -> Prediction
     once, swept = once_terms(size), swept_terms(size)
     alone = sum(model.seconds[name] * value for name, value in once.items()) / speed
     divided = sum(model.seconds[name] * value for name, value in swept.items()) / speed
-    share = model.parallel_share
-    seconds = alone + divided * (1.0 - share + share / threads)
+    fraction = model.parallel_fraction
+    seconds = alone + divided * (1.0 - fraction + fraction / threads)
     n_bytes = sum(model.bytes[name] * value for name, value in memory_terms(size).items())
     return Prediction(seconds, alone + divided, n_bytes)
 
@@ -141,8 +142,8 @@ def swept_terms(size: RunSize) -> dict[str, float]:
     """What takes time in each iteration, likewise."""
     sweeps, cells = size.iterations * size.runs, _cells(size)
     # Rows of voxels, along the last axis, that facets cross: as many facets as nodes, each as large as a cell's side.
-    share = 1.0 / size.ndim
-    rows = size.n_nodes**share * (size.n_voxels * size.elongation) ** (1.0 - share)
+    fraction = 1.0 / size.ndim
+    rows = size.n_nodes**fraction * (size.n_voxels * size.elongation) ** (1.0 - fraction)
     has_surface = size.has_region or size.has_memberships
     is_graded, is_paper = size.mode == "graded", size.mode == "paper"
     return {
@@ -202,7 +203,7 @@ def part_bytes(n_voxels: int, n_cells: int) -> float:
 
 def next_bytes(n_nodes: int, ndim: int = 3) -> float:
     """What the next steps of a run with so many nodes take besides what there is, at most."""
-    return NEXT_SHARE * (meshing_bytes(0, 0, n_nodes, ndim) - KERNEL_BYTES)
+    return NEXT_FRACTION * (meshing_bytes(0, 0, n_nodes, ndim) - KERNEL_BYTES)
 
 
 def _cells(size: RunSize) -> int:

@@ -8,7 +8,7 @@ exchanged is error of the image.
 
 Each node looks at the edges to its neighbours and keeps its best split and its best collapse, all nodes at once; moves
 are then made one after the other, the most worth first, each only if no cell around it has changed since. A move works
-on a node's ring, so one code serves triangles and tetrahedra.
+on a node's star, so one code serves triangles and tetrahedra.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
-    NodeRings,
+    NodeStars,
     State,
     cell_cosine,
     cell_energy,
     cell_squares,
     corner_of,
-    cosine_up_to_floor,
+    cosine_up_to_limit,
     energies,
     facet_area,
     facet_of,
@@ -38,7 +38,7 @@ from tetopt.engine.complex import (
     load,
     load_cell,
     measure_facet,
-    node_rings,
+    node_stars,
     outward,
     pair_tension,
     place,
@@ -56,25 +56,25 @@ from tetopt.engine.smooth import (
     Blocks,
     blocks,
     colours_of,
-    ring_energy,
-    ring_misfit,
-    ring_shape,
-    ring_tension,
+    star_energy,
+    star_misfit,
+    star_shape,
+    star_tension,
     trial_of,
 )
-from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, ring_faces_up, uphill_at
+from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, star_faces_up, uphill_at
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 
-# Of a node's mean share of E: splits worth less are not looked for. The last one made in a round is worth 0.4 to 0.8.
-LEAST_SPLIT_SHARE = 0.2
-LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
+# Of a node's mean part of E: splits worth less are not looked for. The last one made in a round is worth 0.4 to 0.8.
+LEAST_SPLIT_FRACTION = 0.2
+LEAST_EXCHANGE_FRACTION = 1e-3  # of a node's mean part of E: an exchange of two nodes that is worth less is not made
 # Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
 LEAST_OVER_NOISE = 20.0
-MIDDLE_SHIFT_SHARE = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
-SURFACE_VOLUME_SHARE = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
-ROUNDING_SHARE = 1e-9  # of the ring's volume: what a collapse elsewhere may, which is only rounding
+MIDDLE_SHIFT_FRACTION = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
+SURFACE_VOLUME_FRACTION = 0.1  # of the star's volume: what a collapse on a mask's surface may add or take
+ROUNDING_FRACTION = 1e-9  # of the star's volume: what a collapse elsewhere may, which is only rounding
 MAX_NEIGHBOURS = 128  # edges of a node that are looked at, at most
 # What the split of an edge that is too long for its target counts besides what E falls by, times the square of its
 # length over the target: E is about 1 to begin with, so that no other split is before it, and E's digits are kept.
@@ -120,26 +120,26 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     """
     n_before = len(state.complex.ticks)
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
-    rings, groups = node_rings(state), blocks(state.complex.ticks)
+    stars, groups = node_stars(state), blocks(state.complex.ticks)
     state = roomy(state, n_before, 16 * (max(more, 0) + most))
     E_G, squares = energies(state)
     E = state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
     # Splits pay where the error is, collapses where it is not: half of the nodes are looked at for each, unless many
     # nodes are to be put in, or taken out. It costs no E_D that could be measured, and saves half of the time.
-    error = _ring_errors(state, n_before)
+    error = _star_errors(state, n_before)
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8) | too_long(state, limits.target)
-    least = LEAST_SPLIT_SHARE * E / n_before if more <= 0 else -np.inf
-    splits = best_splits(state, rings, may_split, limits._replace(least=least))
+    least = LEAST_SPLIT_FRACTION * E / n_before if more <= 0 else -np.inf
+    splits = best_splits(state, stars, may_split, limits._replace(least=least))
     is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split whatever it costs
     in_ = _best_first(splits)
     dearest = np.inf if more < 0 or is_sized else float(splits.gain[in_[: max(most // 4, 1)]].min(initial=np.inf))
     may_collapse = (error <= middle) | (more < -(n_before // 8)) | is_sized
-    collapses = best_collapses(state, rings, groups, may_collapse, limits._replace(dearest=dearest))
-    least = max(LEAST_EXCHANGE_SHARE * E / n_before, LEAST_OVER_NOISE * state.objective.image * limits.noise)
+    collapses = best_collapses(state, stars, groups, may_collapse, limits._replace(dearest=dearest))
+    least = max(LEAST_EXCHANGE_FRACTION * E / n_before, LEAST_OVER_NOISE * state.objective.image * limits.noise)
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     out = _best_first(collapses)
-    n_split, n_collapsed = make_exchanges(state, rings, splits, collapses, in_, out, (more, most, least), is_dirty)
+    n_split, n_collapsed = make_exchanges(state, stars, splits, collapses, in_, out, (more, most, least), is_dirty)
     return compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
@@ -174,7 +174,7 @@ def _best_first(moves: EdgeMoves) -> NDArray[np.int64]:
     return order[moves.gain[order] > -np.inf]
 
 
-def _ring_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
+def _star_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
     """Sum of squares around the cells' means over the cells around each node, (N,)."""
     cells = state.complex.cells[: state.complex.n_cells[0]]
     squares = np.repeat(cell_squares(state), cells.shape[1])
@@ -214,7 +214,7 @@ def compacted(
 
 @entry
 def make_exchanges(
-    state: State, rings: NodeRings, splits: EdgeMoves, collapses: EdgeMoves, in_: Ints1, out: Ints1,
+    state: State, stars: NodeStars, splits: EdgeMoves, collapses: EdgeMoves, in_: Ints1, out: Ints1,
     quota: tuple[int, int, float], is_dirty: Bools1,
 ) -> tuple[int, int]:  # fmt: skip
     """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are more nodes; then do both in pairs.
@@ -222,7 +222,7 @@ def make_exchanges(
     In their order, and each only if none of its cells has changed. The quota: how many more nodes; at most how many
     pairs; and by how much each pair has to lower E at least. Returns how many were split and collapsed.
     """
-    n_nodes = len(rings.start) - 1
+    n_nodes = len(stars.start) - 1
     more, most, least = quota
     n_split, n_collapsed, s, c = 0, 0, 0, 0
     while True:
@@ -231,81 +231,81 @@ def make_exchanges(
             break
         does_split, does_collapse = is_pair or n_split - n_collapsed < more, is_pair or n_split - n_collapsed > more
         if does_split:
-            while s < len(in_) and not _can_split(state, rings, in_[s], is_dirty):
+            while s < len(in_) and not _can_split(state, stars, in_[s], is_dirty):
                 s += 1
             if s == len(in_):
                 break
-            _mark_edge(state, rings, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner is to be elsewhere
+            _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner is to be elsewhere
         if does_collapse:
-            while c < len(out) and not _can_collapse(state, rings, out[c], collapses.other[out[c]], is_dirty):
+            while c < len(out) and not _can_collapse(state, stars, out[c], collapses.other[out[c]], is_dirty):
                 c += 1
         if does_collapse and (c == len(out) or (is_pair and splits.gain[in_[s]] + collapses.gain[out[c]] <= least)):
             if does_split:
-                _mark_edge(state, rings, in_[s], splits.other[in_[s]], is_dirty, False)
+                _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, False)
             break
         if does_split:
             a, b, p = in_[s], splits.other[in_[s]], n_nodes + n_split
-            _put_middle(state, rings, a, b, p)
-            split_edge(state, rings, a, b, p, is_dirty)
+            _put_middle(state, stars, a, b, p)
+            split_edge(state, stars, a, b, p, is_dirty)
             n_split += 1
         if does_collapse:
-            collapse_edge(state, rings, out[c], collapses.other[out[c]], is_dirty)
+            collapse_edge(state, stars, out[c], collapses.other[out[c]], is_dirty)
             n_collapsed += 1
     close_gaps(state, is_dirty)
     return n_split, n_collapsed
 
 
 @helper
-def _mark_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
-    for r in range(rings.start[a], rings.start[a + 1]):
-        if has_node(state.complex.cells, rings.cells[r], b):
-            is_dirty[rings.cells[r]] = value
+def _mark_edge(state: State, stars: NodeStars, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
+    for r in range(stars.start[a], stars.start[a + 1]):
+        if has_node(state.complex.cells, stars.cells[r], b):
+            is_dirty[stars.cells[r]] = value
 
 
 @helper
-def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
+def _is_clean(stars: NodeStars, node: int, is_dirty: NDArray) -> bool:
     is_clean = True
-    for r in range(rings.start[node], rings.start[node + 1]):
-        is_clean = is_clean and not is_dirty[rings.cells[r]]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        is_clean = is_clean and not is_dirty[stars.cells[r]]
     return is_clean
 
 
 @unit
-def _can_collapse(state: State, rings: NodeRings, a: int, b: int, is_dirty: Bools1) -> bool:
+def _can_collapse(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> bool:
     """Whether nothing has changed around a; nor, between labels, around b and next to either.
 
     A cell that goes takes facets between labels from those beside it, too.
     """
-    if not _is_clean(rings, a, is_dirty):
+    if not _is_clean(stars, a, is_dirty):
         return False
     if state.complex.meeting[a, 1] < 0:
         return True
     for node in (a, b):
-        for r in range(rings.start[node], rings.start[node + 1]):
-            if is_dirty[rings.cells[r]]:
+        for r in range(stars.start[node], stars.start[node + 1]):
+            if is_dirty[stars.cells[r]]:
                 return False
-            for other in state.complex.across[rings.cells[r]]:
+            for other in state.complex.across[stars.cells[r]]:
                 if other >= 0 and is_dirty[other]:
                     return False
     return True
 
 
 @helper
-def _can_split(state: State, rings: NodeRings, a: int, is_dirty: NDArray) -> bool:
+def _can_split(state: State, stars: NodeStars, a: int, is_dirty: NDArray) -> bool:
     """Whether the cells around a are as they were, and there is room for more."""
-    size = rings.start[a + 1] - rings.start[a]
-    return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(rings, a, is_dirty)
+    size = stars.start[a + 1] - stars.start[a]
+    return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(stars, a, is_dirty)
 
 
 @unit
-def _sides_of_edge(state: State, rings: NodeRings, a: int, b: int) -> int:
+def _sides_of_edge(state: State, stars: NodeStars, a: int, b: int) -> int:
     """The box's sides that an edge lies in, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
 
     The boundary's facets at the edge decide, not its ends: they may lie in a side to which the edge is a crease.
     """
     cells, t, sides = state.complex.cells, state.complex.ticks, 0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if not has_node(cells, cell, b):
             continue
         for k in range(cells.shape[1]):
@@ -324,18 +324,18 @@ def _sides_of_edge(state: State, rings: NodeRings, a: int, b: int) -> int:
 
 
 @unit
-def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
+def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
     """Put the node p at the middle of an edge, or on the surface beside it.
 
     False if that is on a boundary that is to stay, or the surface is not reached.
     """
     ticks, cells, is_frozen = state.complex.ticks, state.complex.cells, state.complex.is_frozen
-    sides = _sides_of_edge(state, rings, a, b)
+    sides = _sides_of_edge(state, stars, a, b)
     for d in range(3):
         ticks[p, d] = (ticks[a, d] + ticks[b, d]) >> 1
         is_frozen[p, d] = (sides >> d) & 1 == 1
     is_frozen[p, 3] = sides >= 8
-    n_labels = labels_of_edge(state.complex.meeting[p], state, rings, a, b)
+    n_labels = labels_of_edge(state.complex.meeting[p], state, stars, a, b)
     if (sides > 0 and state.sides.is_fixed) or n_labels > MOST_MEETING:
         return False
     if sides < 8 and n_labels < 2:
@@ -346,13 +346,13 @@ def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
     if not put_on_surface(uphill, state, p):
         return False
     shift = minus(place(ticks, p, a, state.objective), middle)
-    if dot(shift, shift) > MIDDLE_SHIFT_SHARE * MIDDLE_SHIFT_SHARE * squared_length(state, a, b):
+    if dot(shift, shift) > MIDDLE_SHIFT_FRACTION * MIDDLE_SHIFT_FRACTION * squared_length(state, a, b):
         return False
     if sides < 8:
         return True
     uphill_at(uphill, state, p)
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         for k in range(cells.shape[1]):
             is_outer = state.complex.across[cell, k] < 0 and cells[cell, k] not in (a, b)
             if is_outer and has_node(cells, cell, b):
@@ -372,13 +372,13 @@ def is_among(label: int, labels: NDArray) -> bool:
 
 
 @unit
-def labels_of_edge(meeting: Ints1, state: State, rings: NodeRings, a: int, b: int) -> int:
+def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: int) -> int:
     """The labels of the cells around an edge, to `meeting` (4,) if they are 2 to 4, else -1; how many there are."""
     count = 0
     for m in range(MOST_MEETING):
         meeting[m] = -1
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if not has_node(state.complex.cells, cell, b):
             continue
         label = state.complex.labels[cell]
@@ -397,74 +397,74 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
     Judged by minus the cosine of the smallest dihedral angle, counted up to `target`. Cells of `bad` come worst first.
     """
     n_before = len(state.complex.ticks)
-    rings = node_rings(state)
+    stars = node_stars(state)
     state = roomy(state, len(bad), 16 * len(bad))
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
-    n_split, n_collapsed = _mend(state, rings, bad, target, is_dirty)
+    n_split, n_collapsed = _mend(state, stars, bad, target, is_dirty)
     return compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 @entry
-def _mend(state: State, rings: NodeRings, bad: Ints1, target: float, is_dirty: Bools1) -> tuple[int, int]:
+def _mend(state: State, stars: NodeStars, bad: Ints1, target: float, is_dirty: Bools1) -> tuple[int, int]:
     cells, x = state.complex.cells, np.empty((4, 3))
-    n_split, n_collapsed, n_nodes = 0, 0, len(rings.start) - 1
+    n_split, n_collapsed, n_nodes = 0, 0, len(stars.start) - 1
     for cell in bad:
         best, best_a, best_b, is_split = LEAST_LIFT_COSINE, -1, -1, False
         for i in range(4):
             a = cells[cell, i]
-            if is_dirty[cell] or not _is_clean(rings, a, is_dirty):
+            if is_dirty[cell] or not _is_clean(stars, a, is_dirty):
                 continue
             for j in range(4):
                 b, p = cells[cell, j], n_nodes + n_split
                 if i == j:
                     continue
-                may_collapse = _can_collapse(state, rings, a, b, is_dirty)
-                gain = _lift_by_collapse(x, state, rings, a, b, target) if may_collapse else -1.0
+                may_collapse = _can_collapse(state, stars, a, b, is_dirty)
+                gain = _lift_by_collapse(x, state, stars, a, b, target) if may_collapse else -1.0
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
-                if i < j and _can_split(state, rings, a, is_dirty):
-                    may_split = _put_middle(state, rings, a, b, p)
-                    gain = _lift_by_split(x, state, rings, a, b, p, target) if may_split else -1.0
+                if i < j and _can_split(state, stars, a, is_dirty):
+                    may_split = _put_middle(state, stars, a, b, p)
+                    gain = _lift_by_split(x, state, stars, a, b, p, target) if may_split else -1.0
                     if gain > best:
                         best, best_a, best_b, is_split = gain, a, b, True
         if best_a >= 0 and is_split:
             p = n_nodes + n_split
-            _put_middle(state, rings, best_a, best_b, p)
-            split_edge(state, rings, best_a, best_b, p, is_dirty)
+            _put_middle(state, stars, best_a, best_b, p)
+            split_edge(state, stars, best_a, best_b, p, is_dirty)
             n_split += 1
         elif best_a >= 0:
-            collapse_edge(state, rings, best_a, best_b, is_dirty)
+            collapse_edge(state, stars, best_a, best_b, is_dirty)
             n_collapsed += 1
     close_gaps(state, is_dirty)
     return n_split, n_collapsed
 
 
 @helper
-def _lift_by_collapse(x: NDArray, state: State, rings: NodeRings, a: int, b: int, target: float) -> float:
+def _lift_by_collapse(x: NDArray, state: State, stars: NodeStars, a: int, b: int, target: float) -> float:
     """By how much the worst cosine around a grows if a is joined to b."""
     cells, t = state.complex.cells, state.complex.ticks
     if not may_join(state, a, b):
         return -1.0
     here, old, new, size = row(t, a), target, target, 0.0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        old = min(old, cell_cosine(x, state, rings.cells[r]))
+    for r in range(stars.start[a], stars.start[a + 1]):
+        old = min(old, cell_cosine(x, state, stars.cells[r]))
         size += signed_volume(x, 4)
     put_row(t, a, row(t, b))
-    for r in range(rings.start[a], rings.start[a + 1]):
-        if new > old and not has_node(cells, rings.cells[r], b):
-            c = cells[rings.cells[r]]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        if new > old and not has_node(cells, stars.cells[r], b):
+            c = cells[stars.cells[r]]
             new = min(new, tet_cosine(x, state, c[0], c[1], c[2], c[3]))
-    is_whole = new > old and _keeps_domain(x, state, rings, a, b, size)
+    is_whole = new > old and _keeps_domain(x, state, stars, a, b, size)
     put_row(t, a, here)
     return new - old if is_whole else -1.0
 
 
 @helper
-def _lift_by_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p: int, target: float) -> float:
+def _lift_by_split(x: NDArray, state: State, stars: NodeStars, a: int, b: int, p: int, target: float) -> float:
     """By how much the worst cosine around the edge (a, b) grows if it is split at p."""
     old, new = target, target
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if has_node(state.complex.cells, cell, b):
             old = min(old, cell_cosine(x, state, cell))
             for node in (a, b):
@@ -477,15 +477,15 @@ def _lift_by_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p
 # Splits.
 
 
-def best_splits(state: State, rings: NodeRings, may_split: NDArray[np.bool_], limits: Limits) -> EdgeMoves:
-    """The best split of an edge of each node that may be, above the floor, without an edge that is too short.
+def best_splits(state: State, stars: NodeStars, may_split: NDArray[np.bool_], limits: Limits) -> EdgeMoves:
+    """The best split of an edge of each node that may be, above the angle limit, without an edge that is too short.
 
     An edge of two nodes that may counts for the lower one. Rows N to 2 N of `ticks` and `is_frozen` are written to.
     """
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     with few_threads(n_nodes * 20):
-        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits))
+        run(_fill_splits, n_nodes, Splits(moves, state, stars, limits))
     return moves
 
 
@@ -494,20 +494,20 @@ class Splits(NamedTuple):
 
     moves: EdgeMoves
     state: State
-    rings: NodeRings
+    stars: NodeStars
     limits: Limits
 
 
 @unit
 def _fill_splits(work: Splits, node: int) -> None:
     if work.moves.may_move[node]:
-        _best_split(node, work.moves, work.state, work.rings, work.limits)
+        _best_split(node, work.moves, work.state, work.stars, work.limits)
 
 
 @unit
-def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits: Limits) -> None:
+def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits: Limits) -> None:
     x, near = np.empty((4, 3)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    count, best = _neighbours(near, state.complex.cells, rings, a), limits.least
+    count, best = _neighbours(near, state.complex.cells, stars, a), limits.least
     bound = np.empty(MAX_NEIGHBOURS)
     for number in range(count):
         b = near[number]
@@ -515,39 +515,39 @@ def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits
         if (b > a or not moves.may_move[b]) and squared_length(state, a, b) >= 4.0 * limits.shortest * limits.shortest:
             ratio = squared_ratio(state, a, b, limits.target)
             bound[number] = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
-            bound[number] += np.inf if state.objective.surface > 0.0 else _energy_of_edge(state, rings, a, b)
+            bound[number] += np.inf if state.objective.surface > 0.0 else _energy_of_edge(state, stars, a, b)
     for _ in range(count):  # no edge is worth more than what its cells have, so the dearest come first
         number = int(np.argmax(bound[:count]))
         if not bound[number] > best:
             break
         b, p = near[number], len(moves.gain) + a
         bound[number] = -np.inf
-        if _put_middle(state, rings, a, b, p) and _is_long(state, rings, a, b, p, limits.shortest):
+        if _put_middle(state, stars, a, b, p) and _is_long(state, stars, a, b, p, limits.shortest):
             ratio = squared_ratio(state, a, b, limits.target)
             credit = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
-            worth = worth_of_split(x, state, rings, a, b, p, best - credit) + credit
+            worth = worth_of_split(x, state, stars, a, b, p, best - credit) + credit
             if worth > best:
                 best, moves.gain[a], moves.other[a] = worth, worth, b
 
 
 @helper
-def _energy_of_edge(state: State, rings: NodeRings, a: int, b: int) -> float:
+def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
     """What the cells around the edge (a, b) have of E."""
     energy = 0.0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        if has_node(state.complex.cells, rings.cells[r], b):
-            energy += cell_energy(state, rings.cells[r])
+    for r in range(stars.start[a], stars.start[a + 1]):
+        if has_node(state.complex.cells, stars.cells[r], b):
+            energy += cell_energy(state, stars.cells[r])
     return energy
 
 
 @helper
-def _is_long(state: State, rings: NodeRings, a: int, b: int, p: int, shortest: float) -> bool:
+def _is_long(state: State, stars: NodeStars, a: int, b: int, p: int, shortest: float) -> bool:
     """Whether no edge from p to the other corners of the cells around the edge (a, b) is shorter than that."""
     cells = state.complex.cells
     if shortest <= 0.0:
         return True
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if has_node(cells, cell, b):
             for k in range(cells.shape[1]):
                 if squared_length(state, p, cells[cell, k]) < shortest * shortest:
@@ -556,12 +556,12 @@ def _is_long(state: State, rings: NodeRings, a: int, b: int, p: int, shortest: f
 
 
 @unit
-def _neighbours(near: Ints1, cells: Ints2, rings: NodeRings, node: int) -> int:
+def _neighbours(near: Ints1, cells: Ints2, stars: NodeStars, node: int) -> int:
     """The nodes that share a cell with `node`, to `near`, as many as it takes; how many."""
     count = 0
-    for r in range(rings.start[node], rings.start[node + 1]):
+    for r in range(stars.start[node], stars.start[node + 1]):
         for k in range(cells.shape[1]):
-            other = cells[rings.cells[r], k]
+            other = cells[stars.cells[r], k]
             is_new = other != node
             for m in range(count):
                 is_new = is_new and near[m] != other
@@ -572,25 +572,25 @@ def _neighbours(near: Ints1, cells: Ints2, rings: NodeRings, node: int) -> int:
 
 
 @unit
-def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p: int, least_gain: float) -> float:
+def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p: int, least_gain: float) -> float:
     """How much E falls if the edge (a, b) is split at p; -inf if it cannot be, or by less than `least_gain`."""
     cells, fluxes, objective = state.complex.cells, state.complex.fluxes, state.objective
     n = cells.shape[1]
     old, shape = 0.0, 0.0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if not has_node(cells, cell, b):
             continue
         old += cell_energy(state, cell)
-        least = objective.floor if n == 4 else -1.0
+        least = objective.angle_limit if n == 4 else -1.0
         if least > -1.0:
             shape_of_cell(x, state.complex.ticks, cells, cell, objective)
-            least = min(least, cosine_up_to_floor(x, objective))
+            least = min(least, cosine_up_to_limit(x, objective))
         for node in (a, b):
             shape += objective.geometry * _shape_with(x, state, cell, node, p)
             if not shape < np.inf:
                 return -np.inf
-            if least > -1.0 and cosine_up_to_floor(x, objective) < least:
+            if least > -1.0 and cosine_up_to_limit(x, objective) < least:
                 return -np.inf
         if objective.tension > 0.0 and state.complex.meeting[p, 1] >= 0:
             shape += _rise_of_tension(state, cell, a, b, p)
@@ -602,8 +602,8 @@ def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p
     # Unless p was brought to a surface, the two halves of a facet of the edge are all of it: one of them is measured.
     is_beside = state.complex.is_frozen[p, 3] or state.complex.meeting[p, 1] >= 0
     flux, sums = np.empty((1, 1, D)), np.empty((2, D))
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if has_node(cells, cell, b):
             i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
             _put_flux_with(flux, state, cell, i, b, p)
@@ -632,7 +632,7 @@ def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p
 
 @helper
 def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
-    """By how much a cell's facets between labels cost more if the edge (a, b) is split at p: half of it, its share."""
+    """By how much a cell's facets between labels cost more if the edge (a, b) is split at p: half of it."""
     mesh, objective, rise = state.complex, state.objective, 0.0
     for k in range(mesh.cells.shape[1]):
         if mesh.cells[cell, k] in (a, b) or not is_interface(mesh, cell, k):
@@ -667,17 +667,17 @@ def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p:
 
 
 @unit
-def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty: Bools1) -> None:
+def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty: Bools1) -> None:
     """Each cell of the edge (a, b) becomes two: it keeps a, with p for b; a new one has b, with p for a."""
     cells, across, fluxes = state.complex.cells, state.complex.across, state.complex.fluxes
-    n, first, last = cells.shape[1], rings.start[a], rings.start[a + 1]
+    n, first, last = cells.shape[1], stars.start[a], stars.start[a + 1]
     x, new = np.empty((4, 3)), np.full(last - first, -1, dtype=np.int64)
     for r in range(first, last):
-        if has_node(cells, rings.cells[r], b):
+        if has_node(cells, stars.cells[r], b):
             new[r - first] = state.complex.n_cells[0]
             state.complex.n_cells[0] += 1
     for r in range(first, last):
-        cell, other = rings.cells[r], new[r - first]
+        cell, other = stars.cells[r], new[r - first]
         if other < 0:
             continue
         i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
@@ -694,10 +694,10 @@ def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty:
         for k in range(n):
             if k not in (i, j) and across[cell, k] >= 0:
                 for s in range(first, last):
-                    if rings.cells[s] == across[cell, k]:
+                    if stars.cells[s] == across[cell, k]:
                         across[other, k] = new[s - first]
     for r in range(first, last):  # only now: the old corners were needed to find the new neighbours
-        cell, other = rings.cells[r], new[r - first]
+        cell, other = stars.cells[r], new[r - first]
         if other < 0:
             continue
         i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
@@ -715,13 +715,13 @@ def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty:
 
 
 def best_collapses(
-    state: State, rings: NodeRings, groups: Blocks, may_collapse: NDArray[np.bool_], limits: Limits
+    state: State, stars: NodeStars, groups: Blocks, may_collapse: NDArray[np.bool_], limits: Limits
 ) -> EdgeMoves:
-    """The neighbour to which each node that may is best joined, so that a mesh above the floor is left."""
+    """The neighbour to which each node that may is best joined, so that no flat cell is left."""
     n_nodes = len(may_collapse)
     moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
-    laid_out = packed(state), packed(rings), packed(groups)
-    for chosen in colours_of(state, rings, groups):
+    laid_out = packed(state), packed(stars), packed(groups)
+    for chosen in colours_of(state, stars, groups):
         with few_threads(len(chosen) * 10_000):
             run(_fill_collapses, len(chosen), Collapses(moves, *laid_out, chosen, limits))
     return moves
@@ -732,7 +732,7 @@ class Collapses(NamedTuple):
 
     moves: EdgeMoves
     state: State
-    rings: NodeRings
+    stars: NodeStars
     groups: Blocks
     chosen: Ints1  # (G,) the groups
     limits: Limits
@@ -743,32 +743,32 @@ def _fill_collapses(work: Collapses, number: int) -> None:
     groups, block = work.groups, work.chosen[number]
     for at in range(groups.start[block], groups.start[block + 1]):
         if work.moves.may_move[groups.nodes[at]]:
-            _best_collapse(groups.nodes[at], work.moves, work.state, work.rings, work.limits)
+            _best_collapse(groups.nodes[at], work.moves, work.state, work.stars, work.limits)
 
 
 @unit
-def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits: Limits) -> None:
+def _best_collapse(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits: Limits) -> None:
     """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
     cells, t, is_frozen, objective = state.complex.cells, state.complex.ticks, state.complex.is_frozen, state.objective
     if is_frozen[a, 0] and is_frozen[a, 1] and is_frozen[a, 2]:
         return
-    n, trial = cells.shape[1], trial_of(state, rings, a)
+    n, trial = cells.shape[1], trial_of(state, stars, a)
     near, shapes = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.full(MAX_NEIGHBOURS, np.inf)
-    old, least, size = ring_tension(state, rings, a), objective.floor if n == 4 else -1.0, 0.0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        old += cell_energy(state, rings.cells[r])
-        load_cell(trial.x, t, cells, rings.cells[r], objective)
+    old, least, size = star_tension(state, stars, a), objective.angle_limit if n == 4 else -1.0, 0.0
+    for r in range(stars.start[a], stars.start[a + 1]):
+        old += cell_energy(state, stars.cells[r])
+        load_cell(trial.x, t, cells, stars.cells[r], objective)
         size += signed_volume(trial.x, n)
         if least > -1.0:
-            least = min(least, cosine_up_to_floor(trial.x, objective))
-    here, count, best = row(t, a), _neighbours(near, cells, rings, a), old + limits.dearest
-    _, has_misfit = ring_misfit(state, rings, a)
+            least = min(least, cosine_up_to_limit(trial.x, objective))
+    here, count, best = row(t, a), _neighbours(near, cells, stars, a), old + limits.dearest
+    _, has_misfit = star_misfit(state, stars, a)
     for number in range(count):  # shapes are cheap, and a lower bound
         b = near[number]
         if may_join(state, a, b) and _is_short(state, near, count, a, b, limits.longest):
             put_row(t, a, row(t, b))
-            shapes[number] = ring_shape(trial, np.inf if has_misfit else best, least, a, state, rings, b)
-            if shapes[number] < np.inf and not _keeps_domain(trial.x, state, rings, a, b, size):
+            shapes[number] = star_shape(trial, np.inf if has_misfit else best, least, a, state, stars, b)
+            if shapes[number] < np.inf and not _keeps_domain(trial.x, state, stars, a, b, size):
                 shapes[number] = np.inf
             put_row(t, a, here)
     for _ in range(count):
@@ -779,7 +779,7 @@ def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, lim
         shapes[number] = np.inf
         if objective.image > 0.0:
             put_row(t, a, row(t, b))
-            value = ring_energy(trial, best, least, a, state, rings, b)
+            value = star_energy(trial, best, least, a, state, stars, b)
             put_row(t, a, here)
         if value < best:
             best, moves.gain[a], moves.other[a] = value, old - value, b
@@ -809,7 +809,7 @@ def _is_short(state: State, near: Ints1, count: int, a: int, b: int, longest: Fl
 def may_join(state: State, a: int, b: int) -> bool:
     """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on its surfaces.
 
-    The ring would lose volume otherwise (`_keeps_size`), which costs more to find out.
+    The star would lose volume otherwise (`_keeps_size`), which costs more to find out.
     """
     ticks, is_frozen, meeting = state.complex.ticks, state.complex.is_frozen, state.complex.meeting
     may = not is_frozen[a, 3] or is_frozen[b, 3]
@@ -821,21 +821,21 @@ def may_join(state: State, a: int, b: int) -> bool:
 
 
 @unit
-def _keeps_domain(x: Floats2, state: State, rings: NodeRings, a: int, b: int, size: float) -> bool:
-    """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
-    if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, rings, a, b):
+def _keeps_domain(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float) -> bool:
+    """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the star's volume."""
+    if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, stars, a, b):
         return False
     if not state.complex.is_frozen[a, 3]:
-        return _keeps_size(x, state, rings, a, b, size, ROUNDING_SHARE)
+        return _keeps_size(x, state, stars, a, b, size, ROUNDING_FRACTION)
     return (
-        _keeps_size(x, state, rings, a, b, size, SURFACE_VOLUME_SHARE)
-        and _is_linked(state, rings, a, b)
-        and ring_faces_up(np.empty((2, 3)), state, rings, a, b)
+        _keeps_size(x, state, stars, a, b, size, SURFACE_VOLUME_FRACTION)
+        and _is_linked(state, stars, a, b)
+        and star_faces_up(np.empty((2, 3)), state, stars, a, b)
     )
 
 
 @unit
-def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> bool:
+def _stays_between_labels(state: State, stars: NodeStars, a: int, b: int) -> bool:
     """Whether a node between labels may be joined to b so that all labels keep their topology.
 
     All labels that meet at it do so along the whole edge, which therefore lies on the same surface or curve; what holds
@@ -844,30 +844,30 @@ def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> boo
     """
     cells, labels = state.complex.cells, state.complex.labels
     meeting, other = np.empty(MOST_MEETING, dtype=np.int64), np.empty(MOST_MEETING, dtype=np.int64)
-    n_labels = labels_of_edge(meeting, state, rings, a, b)
+    n_labels = labels_of_edge(meeting, state, stars, a, b)
     if n_labels > MOST_MEETING:
         return False
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if not is_among(labels[cell], meeting):
             return False
         if has_node(cells, cell, b) and _is_side(state, cell, a) and _is_side(state, cell, b):
             return False
-    sides = _sides_of_edge(state, rings, a, b)
+    sides = _sides_of_edge(state, stars, a, b)
     for d in range(3):
         if state.complex.is_frozen[a, d] and (sides >> d) & 1 == 0:
             return False
     if n_labels > 2:
         near = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-        for number in range(_neighbours(near, state.complex.cells, rings, a)):
+        for number in range(_neighbours(near, state.complex.cells, stars, a)):
             c = near[number]
             if (
                 c != b
-                and labels_of_edge(other, state, rings, a, c) > 2
-                and labels_of_edge(other, state, rings, b, c) > 2
+                and labels_of_edge(other, state, stars, a, c) > 2
+                and labels_of_edge(other, state, stars, b, c) > 2
             ):
                 return False
-    return _is_linked(state, rings, a, b)
+    return _is_linked(state, stars, a, b)
 
 
 @helper
@@ -878,7 +878,7 @@ def _is_side(state: State, cell: int, node: int) -> bool:
 
 
 @unit
-def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
+def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
     """Whether a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
 
     It has to lie on the boundary, and a node next to both of its ends must be so by a cell with both, on the boundary
@@ -886,30 +886,30 @@ def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
     """
     cells = state.complex.cells
     near, n = np.empty(MAX_NEIGHBOURS, dtype=np.int64), cells.shape[1]
-    edge = _is_outer(state, rings, a, b, -1)
-    for number in range(_neighbours(near, cells, rings, a)):
+    edge = _is_outer(state, stars, a, b, -1)
+    for number in range(_neighbours(near, cells, stars, a)):
         c = near[number]
         has_both, is_next = False, False
-        for r in range(rings.start[b], rings.start[b + 1]):
-            if has_node(cells, rings.cells[r], c):
+        for r in range(stars.start[b], stars.start[b + 1]):
+            if has_node(cells, stars.cells[r], c):
                 is_next = True
-                has_both = has_both or has_node(cells, rings.cells[r], a)
+                has_both = has_both or has_node(cells, stars.cells[r], a)
         if c == b or not is_next:
             continue
         if not has_both:
             return False
-        are_outer = n == 4 and _is_outer(state, rings, a, c, -1) and _is_outer(state, rings, b, c, -1)
-        if are_outer and not _is_outer(state, rings, a, b, c):
+        are_outer = n == 4 and _is_outer(state, stars, a, c, -1) and _is_outer(state, stars, b, c, -1)
+        if are_outer and not _is_outer(state, stars, a, b, c):
             return False
     return edge
 
 
 @helper
-def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
+def _is_outer(state: State, stars: NodeStars, a: int, b: int, c: int) -> bool:
     """Whether a facet of the boundary, or between labels, has the nodes a and b, and c unless that is -1."""
     cells = state.complex.cells
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if has_node(cells, cell, b) and (c < 0 or has_node(cells, cell, c)):
             for k in range(cells.shape[1]):
                 is_outer = state.complex.across[cell, k] < 0 or is_interface(state.complex, cell, k)
@@ -919,27 +919,28 @@ def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
 
 
 @unit
-def _keeps_size(x: Floats2, state: State, rings: NodeRings, a: int, b: int, size: float, share: float) -> bool:
-    """Whether the cells around a, moved to b, fill what they filled, but for a share: n! times their volume is `size`.
+def _keeps_size(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float, fraction: float) -> bool:
+    """Whether the cells around a, moved to b, fill what they filled, but for a fraction: n! times their volume is
+    `size`.
 
-    All cells positive, they fan out from b over the ring's hull; so this holds unless the domain itself is not convex
+    All cells positive, they fan out from b over the star's hull; so this holds unless the domain itself is not convex
     there.
     """
     cells = state.complex.cells
     total = 0.0
-    for r in range(rings.start[a], rings.start[a + 1]):
-        if not has_node(cells, rings.cells[r], b):
-            load_cell(x, state.complex.ticks, cells, rings.cells[r], state.objective)
+    for r in range(stars.start[a], stars.start[a + 1]):
+        if not has_node(cells, stars.cells[r], b):
+            load_cell(x, state.complex.ticks, cells, stars.cells[r], state.objective)
             total += signed_volume(x, cells.shape[1])
-    return abs(total - size) <= share * size
+    return abs(total - size) <= fraction * size
 
 
 @unit
-def collapse_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: Bools1) -> None:
+def collapse_edge(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> None:
     """Node a becomes b: cells with both go, and the others around a have b instead."""
     cells, across, x = state.complex.cells, state.complex.across, np.empty((4, 3))
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         is_dirty[cell] = True
         if has_node(cells, cell, b):
             # What lay beyond its facets opposite a and b are neighbours now.
@@ -948,8 +949,8 @@ def collapse_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: Bool
                 across[of_a, facet_of(across, of_a, cell)] = of_b
             if of_b >= 0:
                 across[of_b, facet_of(across, of_b, cell)] = of_a
-    for r in range(rings.start[a], rings.start[a + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[a], stars.start[a + 1]):
+        cell = stars.cells[r]
         if has_node(cells, cell, b):
             cells[cell, 0] = -1
             continue

@@ -1,11 +1,11 @@
-"""The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, with a floor on angles.
+"""The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, above a minimum angle.
 
-Each iteration moves the nodes that can hope to lower their rings' energies (`smooth`) and then exchanges cells wherever
-that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle under the
-floor, and a lattice starts far above it, so E falls from first to last, unless nodes are brought between labels.
-Cells of other initial meshes that are under the floor are mended at the end (`repair`), if nothing else has lifted
-them. Keeping the floor all along costs as much E_D as lifting the worst cells once E has settled (0.3587 of the
-initial one against 0.3560: MNI152 T1, 4,864 nodes, k_D = 0.5), and E need not rise for it.
+Each iteration moves the nodes that can hope to lower their stars' energies (`smooth`) and then exchanges cells wherever
+that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle below the
+minimum, and a lattice starts far above it, so E falls from first to last, unless nodes are brought between labels.
+Cells of other initial meshes that are below it are mended at the end (`repair`), if nothing else has lifted them.
+Keeping it all along costs as much E_D as lifting the worst cells once E has settled (0.3587 of the initial one against
+0.3560: MNI152 T1, 4,864 nodes, k_D = 0.5), and E need not rise for it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
-from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure, without_cells
+from tetopt.engine.complex import State, copied, interface_energy, node_stars, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import mend_pinches, relabel, with_labels
@@ -37,10 +37,10 @@ from tetopt.engine.loop import (
     relative_movement,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.promises import promised
 from tetopt.engine.repair import cell_cosines, n_cells_below, repair
+from tetopt.engine.requirements import checked
 from tetopt.engine.smooth import _gradients, attract, blocks, sweep
-from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
+from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
@@ -52,16 +52,17 @@ from tetopt.start.sizes import Sizes
 from tetopt.system.kernels import link, roots
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
-HOPE_SHARE = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved
-EARLY_HOPE_SHARE = 0.05  # likewise, as long as nodes are exchanged: cells change around them anyway
-EXCHANGING_SHARE = 0.7  # of the iterations: the first ones, in which nodes are exchanged
-EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at once
+HOPE_FRACTION = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved
+EARLY_HOPE_FRACTION = 0.05  # likewise, as long as nodes are exchanged: cells change around them anyway
+EXCHANGING_FRACTION = 0.7  # of the iterations: the first ones, in which nodes are exchanged
+EXCHANGED_FRACTION = 0.1  # of the requested nodes: the most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
 LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
 LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
-ATTRACTED_FLOOR = 4.0  # degrees: cells may be as flat, if not the floor is lower, until nodes have come between labels
-# As many cells on a mask's boundary may be taken out where nothing lifts them: a share of all cells, or this number.
-FLAT_SHARE, FLAT_CELLS = 0.005, 10
+# degrees: cells may be as flat, if `min_dihedral` is no lower, until nodes are between labels
+ATTRACTED_MIN_DIHEDRAL = 4.0
+# As many cells on a mask's boundary may be taken out where nothing lifts them: a fraction of all cells, or this number.
+FLAT_FRACTION, FLAT_CELLS = 0.005, 10
 MEND_ROUNDS = 3  # of lifting and taking out, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
@@ -102,8 +103,8 @@ def optimize(
         `tetopt.engine.complex.shape_energy`). 1 is the paper's energy, which does not see slivers; above 2.5 it grows
         without bound as a cell goes flat.
     min_dihedral : float
-        The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no floor) to below 70. How many
-        cells miss it is for the caller to count (`tetopt.quality`); meshes of triangles have no floor.
+        The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no bound) to below 70. How many
+        cells are below it is for the caller to count (`tetopt.quality`); meshes of triangles have no such bound.
     boundary : {"slide", "fixed"}
         Boundary nodes move within the box's faces and edges, those not on the box are fixed or, with a mask, whose
         surface they are taken to lie on, slide on that; or the boundary stays as it is, node for node and facet for
@@ -119,8 +120,8 @@ def optimize(
     tolerance : float
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
-        Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to, which, like the
-        flips of an iteration, takes its time besides.
+        Stop at the next colour of nodes after this time; the mesh is valid, and its minimum dihedral angle is seen to,
+        which, like the flips of an iteration, takes its time besides.
     callback : callable, optional
         Called with each `IterationRecord`; without one a notebook shows a bar. Its E_G is the weighted one, its
         `is_retessellated` whether cells were exchanged.
@@ -130,11 +131,12 @@ def optimize(
     Returns
     -------
     MeshingResult
-        Mesh, history, why it ended, and in `missed` which of its promises it does not keep (`tetopt.engine.promises`):
-        a floor that cells are under, voxels in two cells, a mask or labels that cells are too large for. The mesh
-        covers the same domain, every cell is positively oriented. E never rises from one record to the next, unless
-        cells had to be lifted over the floor, for which nodes may be put in or taken out, or nodes were exchanged, or
-        brought between labels; it is another E once cells have labels. The same bits on any number of threads.
+        Mesh, history, why it ended, and in `violated` which requirements it does not meet
+        (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells, a mask or labels that
+        cells are too large for. The mesh covers the same domain, every cell is positively oriented. E never rises from
+        one record to the next, unless cells had to be lifted above the minimum dihedral angle, for which nodes may be
+        put in or taken out, or nodes were exchanged, or brought between labels; it is another E once cells have labels.
+        The same bits on any number of threads.
 
     Raises
     ------
@@ -163,18 +165,20 @@ def optimize(
     content = plain(image)
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
     run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
-    floor = min_dihedral if run.n == 3 else 0.0
+    min_dihedral = min_dihedral if run.n == 3 else 0.0
     # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
-    n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
-    course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes, carves=boundary != "fixed")
+    n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
+    course = Course(
+        1, iterations, iterations, n_early, min_dihedral, tolerance, nodes, sizes, carves=boundary != "fixed"
+    )
     history, ended = followed(run, course, is_over, begin, callback)
     if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
         run.give_labels()
-        run.mend_surfaces(False, floor)
+        run.mend_surfaces(False, min_dihedral)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
     result = MeshingResult(run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped)
-    return promised(result, content, floor, mesh)
+    return checked(result, content, min_dihedral, mesh)
 
 
 class Course(NamedTuple):
@@ -184,7 +188,7 @@ class Course(NamedTuple):
     last: int
     iterations: int  # in all
     n_early: int  # the first of them, in which nodes are exchanged
-    floor: float  # degrees
+    min_dihedral: float  # degrees
     tolerance: float  # as of `optimize`
     nodes: int | None  # as of `optimize`
     sizes: Sizes
@@ -200,7 +204,7 @@ def followed(
 ) -> tuple[list[IterationRecord], str]:
     """Do the iterations of a course; the records, and why it ended: "iterations", "converged" or "over"."""
     history: list[IterationRecord] = []
-    floor, nodes = course.floor, course.nodes
+    min_dihedral, nodes = course.min_dihedral, course.nodes
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
         history.append(run.record(iteration, movement, is_changed, time.perf_counter() - begin))
@@ -209,17 +213,17 @@ def followed(
 
     record(course.first - 1, 0.0, False)
     if course.iterations > 0:
-        run.keep_floor(floor)
+        run.keep_min_dihedral(min_dihedral)
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
     for iteration in range(course.first, course.last + 1):
         before = run.state.complex.ticks.copy()
         if has_labels and iteration == min(LABELLED_AT, course.iterations):
             run.give_labels()
         if run.has_labels:
-            run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= course.n_early else floor)
+            run.attract(min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral)
         # 1. Move the nodes.
         is_early = nodes is not None and iteration <= course.n_early
-        is_finished = run.sweep(is_over, EARLY_HOPE_SHARE if is_early else HOPE_SHARE)
+        is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION)
         # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
@@ -229,10 +233,10 @@ def followed(
         # 3. Exchange nodes: in every other one of the first iterations.
         if nodes is not None and does_exchange:
             n_changes += run.exchange_towards(nodes, course.sizes)
-        # 4. Lift what is under the floor and mend what is not a manifold: in the last iteration. Parts do so in every
+        # 4. Lift flat cells and mend what is not a manifold: in the last iteration. Parts do so in every
         # round, as in the next one what is under it may have nodes that stay.
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
-        n_lifted, n_gone = run.mend(course.carves, floor) if is_last else (0, 0)
+        n_lifted, n_gone = run.mend(course.carves, min_dihedral) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
         # 5. Measure.
         record(iteration, movement, n_changes > 0)
@@ -318,16 +322,16 @@ class Run:
         objective = self.state.objective
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
-    def sweep(self, is_over: Callable[[], bool] = lambda: False, share: float = HOPE_SHARE) -> bool:
+    def sweep(self, is_over: Callable[[], bool] = lambda: False, fraction: float = HOPE_FRACTION) -> bool:
         """Move the nodes that may win something; False if `is_over` cut it short.
 
         A node may win what its last move did, and what has been won around it since then: the mean over its
-        neighbours, sweep by sweep. It is left alone until that is a share of what E is to a node. One whose cells were
-        exchanged may win anything.
+        neighbours, sweep by sweep. It is left alone until that is a fraction of what E is to a node. One whose cells
+        were exchanged may win anything.
         """
         gains = np.zeros(len(self.hope))
-        is_active = (self.hope > share * self.E() / len(gains)) & ~self.is_still
-        is_finished = sweep(self.state, node_rings(self.state), self.groups, is_active, is_over, gains)
+        is_active = (self.hope > fraction * self.E() / len(gains)) & ~self.is_still
+        is_finished = sweep(self.state, node_stars(self.state), self.groups, is_active, is_over, gains)
         around = np.bincount(self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains))
         number = np.bincount(self.cells.ravel(), minlength=len(gains))
         self.hope = np.where(is_active, gains, self.hope) + (around / np.maximum(number, 1) - gains) / self.n
@@ -342,11 +346,11 @@ class Run:
         self.hope[is_touched] = np.inf
         return n_flips
 
-    def _moved(self, since: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
-        """Nodes that are more than a share of an edge away from `since`, which is brought up to date for them."""
+    def _moved(self, since: NDArray[np.int64], fraction: float) -> NDArray[np.bool_]:
+        """Nodes that are more than a fraction of an edge away from `since`, which is brought up to date for them."""
         matrix = self.state.objective.matrix
         way = transformed((self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits)
-        moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (share * self.edge) ** 2
+        moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
         since[moved] = self.state.complex.ticks[moved]
         return moved
 
@@ -356,7 +360,7 @@ class Run:
         Targets are reached from any mesh, also one with a tenth of the nodes; to move them first would be in vain.
         """
         n_changes = n_last = self.exchange(nodes, sizes)
-        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_SHARE * nodes:
+        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_FRACTION * nodes:
             n_last = self.exchange(nodes, sizes)
             n_changes += n_last
         return n_changes
@@ -377,7 +381,7 @@ class Run:
         shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
         limits = Limits(shortest, longest, self.image_noise, target)
         eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
-        made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_SHARE * nodes), limits)
+        made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_FRACTION * nodes), limits)
         self._renumber(made.state._replace(objective=objective), made.source)
         self.hope[made.is_touched] = np.inf
         self.ticks_flipped[made.is_touched] = FAR_TICKS
@@ -395,37 +399,37 @@ class Run:
     def attract(self, degrees: float) -> None:
         """Let cells take other labels where that pays, and bring nodes between labels to where those meet.
 
-        No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none under the floor.
+        No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none below the minimum.
         """
         ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
         relabel(self.state)
-        lowest = floor_of(degrees)[0]
+        lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:
-            lowest = max(lowest, self.state.objective.floor)
-        attract(self.state, node_rings(self.state), self.groups, lowest)
+            lowest = max(lowest, self.state.objective.angle_limit)
+        attract(self.state, node_stars(self.state), self.groups, lowest)
         is_other = (self.state.complex.ticks != ticks).any(axis=1)[self.cells].any(axis=1)
         is_other |= (self.state.complex.labels != labels)[: self.n_cells]
         self.hope[self.cells[is_other]] = np.inf
 
-    def keep_floor(self, degrees: float) -> None:
+    def keep_min_dihedral(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
-        self.state = with_floor(self.state, degrees)
+        self.state = with_min_dihedral(self.state, degrees)
 
     def n_below(self, degrees: float) -> int:
         """Tetrahedra with an angle under `degrees`."""
         return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
-    def mend(self, carves: bool, floor: float) -> tuple[int, int]:
-        """Lift cells over the floor, degrees, and mend surfaces: again where cells that were taken out made room.
+    def mend(self, carves: bool, min_dihedral: float) -> tuple[int, int]:
+        """Lift cells above `min_dihedral`, degrees, and mend surfaces: again where cells that were taken out made room.
 
         Returns the number of moves, and of cells taken out.
         """
         n_lifted = n_gone = 0
         for _ in range(MEND_ROUNDS):
-            n_lifted += self.lift(floor, carves) if self.n_below(floor) > 0 else 0
-            n_new = self.mend_surfaces(carves, floor)
+            n_lifted += self.lift(min_dihedral, carves) if self.n_below(min_dihedral) > 0 else 0
+            n_new = self.mend_surfaces(carves, min_dihedral)
             n_gone += n_new
-            if n_new == 0 or self.n_below(floor) == 0:
+            if n_new == 0 or self.n_below(min_dihedral) == 0:
                 break
         return n_lifted, n_gone
 
@@ -433,7 +437,8 @@ class Run:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
 
         On the surface of a mask whose details are as small as the cells it may lay cells over one another: more than
-        may be taken out (none, unless it `carves`). Then none of it is done, and the floor is missed.
+        may be taken out (none, unless it `carves`). Then none of it is done, and cells stay below the minimum dihedral
+        angle.
         """
         before = self.state if self.content.region is None else copied(self.state)
         made = repair(self.state, degrees)
@@ -446,19 +451,19 @@ class Run:
         self.hope[:] = np.inf
         return made.n_moves
 
-    def mend_surfaces(self, carves: bool, floor: float = 0.0) -> int:
+    def mend_surfaces(self, carves: bool, min_dihedral: float = 0.0) -> int:
         """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by taking out cells; then of interfaces.
 
         Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two; the octree
         within a mask has no pinch, but a mesh of the user's may. A few cells on the boundary that nothing lifted over
-        the floor, degrees, go, too. Returns how many cells were taken out.
+        `min_dihedral`, degrees, go, too. Returns how many cells were taken out.
         """
         n_gone = 0
         if carves and self.content.region is not None:
             n_gone = self._take_out(self._overlapping(self.state))
-            if self.n == 3 and floor > 0.0:
+            if self.n == 3 and min_dihedral > 0.0:
                 is_outer = (self.state.complex.across[: self.n_cells] < 0).any(axis=1)
-                is_flat = is_outer & (cell_cosines(self.state) < floor_of(floor)[0])
+                is_flat = is_outer & (cell_cosines(self.state) < angle_limit_of(min_dihedral)[0])
                 if is_flat.sum() <= self.most_gone:
                     n_gone += self._take_out(is_flat)
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
@@ -469,8 +474,8 @@ class Run:
 
     @property
     def most_gone(self) -> float:
-        """How many cells may be taken out for the floor."""
-        return max(FLAT_SHARE * self.n_cells, FLAT_CELLS)
+        """How many cells may be taken out for being flat."""
+        return max(FLAT_FRACTION * self.n_cells, FLAT_CELLS)
 
     def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
         if is_gone.any():

@@ -61,7 +61,7 @@ from tetopt.system.kernels import (
 )
 
 POLYGON_CORNERS = 7  # corners of the largest polygon around an edge that is triangulated anew
-LEAST_FLIP_SHARE = 1e-9  # of the cavity's energy: a smaller gain may be rounding
+LEAST_FLIP_FRACTION = 1e-9  # of the cavity's energy: a smaller gain may be rounding
 TET_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # between corners of a cell
 
 
@@ -216,7 +216,7 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
     if V_uv <= 0.0 or V_vw <= 0.0 or V_wu <= 0.0:
         return -np.inf
     old = cell_energy(state, cell) + cell_energy(state, other)
-    limit = old * (1.0 - LEAST_FLIP_SHARE)
+    limit = old * (1.0 - LEAST_FLIP_FRACTION)
     new = 0.0
     for volume, a, b in ((V_uv, 1, 2), (V_vw, 2, 3), (V_wu, 3, 1)):
         new += state.objective.geometry * tet_energy(
@@ -224,8 +224,8 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
         )
         if not new < limit:
             return -np.inf
-    if state.objective.floor > -1.0:
-        least = min(state.objective.floor, cell_cosine(x, state, cell), cell_cosine(x, state, other))
+    if state.objective.angle_limit > -1.0:
+        least = min(state.objective.angle_limit, cell_cosine(x, state, cell), cell_cosine(x, state, other))
         for a, b in ((u, v), (v, w), (w, u)):
             if tet_cosine(x, state, p, q, a, b) < least:
                 return -np.inf
@@ -411,7 +411,7 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     old = _fall_of_tension(work, state, a, b)
     for r in range(m - is_open):
         old += cell_energy(state, around[r])
-    limit = old * (1.0 - LEAST_FLIP_SHARE)
+    limit = old * (1.0 - LEAST_FLIP_FRACTION)
     for d in range(3):
         y[0, d] = 0.0
     load(y, 1, state.complex.ticks, b, a, state.objective)
@@ -438,9 +438,9 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
                     triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
     if not best_triangulation(cost, apex, triangle, m) < limit:
         return -np.inf
-    # The floor last: few edges come so far, and its angles cost more than energies (half of a pass, when first).
-    if state.objective.floor > -1.0:
-        least = state.objective.floor
+    # The angles last: few edges come so far, and they cost more than energies (half of a pass, when first).
+    if state.objective.angle_limit > -1.0:
+        least = state.objective.angle_limit
         for r in range(m - is_open):
             least = min(least, cell_cosine(work.x, state, around[r]))
         for i in range(m - 2):
@@ -843,7 +843,7 @@ def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -
     p, q = cells[cell, k], cells[other, m]
     u, v = cells[cell, (k + 1) % 3], cells[cell, (k + 2) % 3]
     old = cell_energy(state, cell) + cell_energy(state, other)
-    limit = old * (1.0 - LEAST_FLIP_SHARE)
+    limit = old * (1.0 - LEAST_FLIP_FRACTION)
     new = objective.geometry * shape_of_triangle(x, ticks, p, u, q, objective)
     if new < limit:
         new += objective.geometry * shape_of_triangle(x, ticks, p, q, v, objective)

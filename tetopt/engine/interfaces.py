@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
-from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_pieces
+from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
+from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_components
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import centroids, volumes
@@ -25,17 +25,17 @@ from tetopt.mesh import Mesh
 from tetopt.system.kernels import Floats1, Ints1, entry, helper, unit
 
 RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
-LEAST_RELABELLING_SHARE = 1e-9  # of the energies weighed: a smaller gain may be rounding
+LEAST_RELABELLING_FRACTION = 1e-9  # of the energies weighed: a smaller gain may be rounding
 
 
 def with_labels(state: State, content: Content, smooth: SmoothLabels, mesh: Mesh) -> State:
     """The state with a label for each cell, of the content's, and an objective that counts what is not of it."""
     members, tension, own_channel, own_value = smooth
-    pieces = voxel_pieces(members.partition, len(members.labels))
+    components = voxel_components(members.partition, len(members.labels))
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     state.complex.labels[:n_cells] = labelled(
-        mesh.points, mesh.cells, across, cell_counts(image, members, mesh), pieces
+        mesh.points, mesh.cells, across, cell_counts(image, members, mesh), components
     ).labels
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
@@ -46,7 +46,7 @@ def with_labels(state: State, content: Content, smooth: SmoothLabels, mesh: Mesh
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
     state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
-    _meet_everywhere(state, node_rings(state))
+    _meet_everywhere(state, node_stars(state))
     return state
 
 
@@ -56,7 +56,7 @@ def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh) -
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
         labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(image, members, mesh), labels)
-        _meet_everywhere(state, node_rings(state))
+        _meet_everywhere(state, node_stars(state))
 
 
 def cell_counts(image: Image, members: Memberships, mesh: Mesh) -> scipy.sparse.csr_array:
@@ -81,13 +81,13 @@ def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
 
 
 @unit
-def _meet(state: State, rings: NodeRings, node: int) -> None:
+def _meet(state: State, stars: NodeStars, node: int) -> None:
     """Note which labels the cells around a node have."""
     meeting, count = state.complex.meeting[node], 0
     for m in range(MOST_MEETING):
         meeting[m] = -1
-    for r in range(rings.start[node], rings.start[node + 1]):
-        label, is_new = state.complex.labels[rings.cells[r]], True
+    for r in range(stars.start[node], stars.start[node + 1]):
+        label, is_new = state.complex.labels[stars.cells[r]], True
         for m in range(count):
             is_new = is_new and meeting[m] != label
         if is_new and count < MOST_MEETING:
@@ -102,19 +102,19 @@ def _meet(state: State, rings: NodeRings, node: int) -> None:
 
 
 @entry
-def _meet_everywhere(state: State, rings: NodeRings) -> None:
+def _meet_everywhere(state: State, stars: NodeStars) -> None:
     for node in range(len(state.complex.ticks)):
-        _meet(state, rings, node)
+        _meet(state, stars, node)
 
 
 def relabel(state: State) -> int:
     """Let cells beside an interface take a neighbour's label where E falls and no topology changes; how many did."""
-    rings, total = node_rings(state), 0
+    stars, total = node_stars(state), 0
     gain, label = np.zeros(int(state.complex.n_cells[0])), np.zeros(int(state.complex.n_cells[0]), dtype=np.int64)
     for _ in range(RELABELLING_PASSES):
         _find_relabellings(gain, label, state)
         order = np.flatnonzero(gain > 0.0)
-        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, state, rings)
+        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, state, stars)
         total += moved
         if moved == 0:
             break
@@ -145,7 +145,7 @@ def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) ->
         if own < 0.0:
             own = _price(state, cell, mesh.labels[cell])
         more = own - _price(state, cell, mesh.labels[other])
-        if more > max(gain[cell], LEAST_RELABELLING_SHARE * own):
+        if more > max(gain[cell], LEAST_RELABELLING_FRACTION * own):
             gain[cell], label[cell] = more, mesh.labels[other]
 
 
@@ -156,15 +156,15 @@ def _find_relabellings(gain: Floats1, label: Ints1, state: State) -> None:
 
 
 @entry
-def _relabel(order: Ints1, gain: Floats1, label: Ints1, state: State, rings: NodeRings) -> int:
+def _relabel(order: Ints1, gain: Floats1, label: Ints1, state: State, stars: NodeStars) -> int:
     mesh, moved = state.complex, 0
     for cell in order:
         _find_relabelling(gain, label, state, cell)
         if gain[cell] > 0.0 and keeps_topology(
-            mesh.cells, mesh.across, mesh.labels, rings.start, rings.cells, cell, label[cell]
+            mesh.cells, mesh.across, mesh.labels, stars.start, stars.cells, cell, label[cell]
         ):
             mesh.labels[cell] = label[cell]
             for k in range(mesh.cells.shape[1]):
-                _meet(state, rings, mesh.cells[cell, k])
+                _meet(state, stars, mesh.cells[cell, k])
             moved += 1
     return moved

@@ -7,8 +7,8 @@ The labels minimise a Potts energy on the dual graph of a mesh that stays as it 
 
 a surface tension in mm: how far a surface would move to save itself. A ball smaller than three of it in radius, or a
 sheet thinner than two, costs more than it is worth. From the labels that most voxels of each cell have, cells take
-the label of a neighbour, the best move first, as long as the energy falls. Then pieces of cells that no piece of
-voxels justifies go to their neighbours, and what is not manifold is mended by the cells around it that cost least.
+the label of a neighbour, the best move first, as long as the energy falls. Then components of cells that no component
+of voxels justifies go to their neighbours, and what is not manifold is mended by the cells around it that cost least.
 
 An interface is manifold at an edge or a node if, of each label there, the cells around it are one fan, and all
 others, with the outside among them, are one, too: linked by facets that contain the edge or the node.
@@ -25,16 +25,17 @@ from numpy.typing import NDArray
 
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
-from tetopt.geometry.topology import rings
+from tetopt.geometry.topology import stars
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
-TENSION_SHARE = (
+TENSION_FRACTION = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
 )
-LEAST_SHARE = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
-LAST_SHARE = 0.1  # of that: mending may take more in the end, rather than leave a pinch
-PIECE_SHARE = 0.5  # of the voxels of a piece of cells that a piece of voxels has at least, if it is to justify it
-BRIDGE_SHARE = 3.0  # of the voxels lost with a piece: what a bridge may cost; with 1 a coarse mesh loses half a rib
+LEAST_FRACTION = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
+LAST_FRACTION = 0.1  # of that: mending may take more in the end, rather than leave a pinch
+# of the voxels of a component of cells that a component of voxels has at least, if it is to justify it
+COMPONENT_FRACTION = 0.5
+BRIDGE_RATIO = 3.0  # of the voxels lost with a component: what a bridge may cost; with 1 a coarse mesh loses half a rib
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
 TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: what is not manifold between two labels goes at any cost
 MORE_LABELS_WEIGHT = 0.3  # where more labels meet: edges go with it, and with 4 a tenth of small organs' Dice, too
@@ -48,7 +49,7 @@ class Labelling(NamedTuple):
     n_moved: int  # cells whose label is not the one of most of their voxels
     n_nonmanifold_edges: int  # where only two labels meet; nodes in 2-D have no edges, 0
     n_nonmanifold_nodes: int
-    pieces: NDArray[np.int64]  # (K,) pieces of cells, linked by facets
+    components: NDArray[np.int64]  # (K,) components of cells, linked by facets
     lost: NDArray[np.int64]  # labels with voxels but without cells
 
 
@@ -57,8 +58,8 @@ class Dual(NamedTuple):
 
     cells: Ints2  # (M, n+1)
     across: Ints2  # (M, n+1) the cell beyond each facet; -1 outside
-    ring_start: Ints1  # (N+1,)
-    ring_cells: Ints1  # (M (n+1),) the cells around each node, ascending
+    star_start: Ints1  # (N+1,)
+    star_cells: Ints1  # (M (n+1),) the cells around each node, ascending
     size: Floats1  # (M,) volumes, mm^n
     scale: Floats1  # (N,) mean volume of the cells around each node
     tension: Floats2  # (M, n+1) what each facet costs between different labels, mm^n; 0 on the boundary
@@ -69,7 +70,7 @@ class Dual(NamedTuple):
 
 def labelled(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
-    pieces: list[NDArray], weight: float | None = None,
+    components: list[NDArray], weight: float | None = None,
 ) -> Labelling:  # fmt: skip
     """The label of each cell of a mesh: close to the voxels in it, interfaces short and manifold, no fragments.
 
@@ -85,11 +86,11 @@ def labelled(
     across : (M, n+1) int64
         The cell beyond each facet, opposite each corner; -1 outside.
     counts : (M, K) sparse array in rows
-        Voxels of each label in each cell, with shares of a voxel where a cell holds no centre. No row is empty.
-    pieces : list of K arrays
-        Voxels in each piece of each label, falling: `voxel_pieces`. As many pieces of cells may stay.
+        Voxels of each label in each cell, with fractions of a voxel where a cell holds no centre. No row is empty.
+    components : list of K arrays
+        Voxels in each component of each label, falling: `voxel_components`. As many components of cells may stay.
     weight : float, optional
-        Surface tension, mm; by default `TENSION_SHARE` of the mean edge of the two cells at each facet.
+        Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
     Returns
     -------
@@ -98,25 +99,25 @@ def labelled(
     dual, n_labels = _dual(points, cells, across, counts, weight), counts.shape[1]
     begin = _majority(dual)
     labels, voxel = begin.copy(), float(dual.volume.sum() / counts.sum())
-    least = (LEAST_SHARE * np.bincount(dual.row, dual.volume, n_labels)).astype(np.float64)
+    least = (LEAST_FRACTION * np.bincount(dual.row, dual.volume, n_labels)).astype(np.float64)
     _settle(dual, labels, least, False)
     is_bridge = np.zeros(len(labels), dtype=bool)
     for _ in range(MENDING_ROUNDS):
-        moved = _without_fragments(dual, labels, is_bridge, voxel, pieces)
+        moved = _without_fragments(dual, labels, is_bridge, voxel, components)
         moved += _mended(dual, labels, is_bridge, least)
         moved += _settle(dual, labels, least, True)
         if moved == 0:
             break
-    _mend_pairs(dual, labels, LAST_SHARE * least)
+    _mend_pairs(dual, labels, LAST_FRACTION * least)
     faces, is_two = _nonmanifold(dual, labels)
-    _, of_piece = pieces_of(across, labels)
+    _, of_component = components_of(across, labels)
     present = np.bincount(dual.row, dual.volume, n_labels) > 0.0
     return Labelling(
         labels,
         int((labels != begin).sum()),
         int((is_two & (faces[:, 1] >= 0)).sum()),
         int((is_two & (faces[:, 1] < 0)).sum()),
-        np.bincount(of_piece, minlength=n_labels),
+        np.bincount(of_component, minlength=n_labels),
         np.flatnonzero(present & (np.bincount(labels, minlength=n_labels) == 0)),
     )
 
@@ -134,33 +135,33 @@ def unpinched(
     return labels
 
 
-def voxel_pieces(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
-    """Voxels in each piece of each label of a grid, falling; linked by faces."""
+def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
+    """Voxels in each component of each label of a grid, falling; linked by faces."""
     boxes = scipy.ndimage.find_objects(partition + 1, n_labels)
     parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
     return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
 
 
-def pieces_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The piece of each cell, (M,), linked by facets between cells of one label; and the label of each piece."""
+def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The component of each cell, (M,), linked by facets between cells of one label; and each component's label."""
     one = np.repeat(np.arange(len(labels)), across.shape[1])
     other = across.ravel()
     is_link = (other > one) & (labels[one] == labels[other])
     linked = one[is_link], other[is_link]
     links = scipy.sparse.coo_array((np.ones(is_link.sum(), dtype=np.int8), linked), shape=(len(labels),) * 2)
     n_pieces, number = scipy.sparse.csgraph.connected_components(links, directed=False)
-    of_piece = np.empty(n_pieces, dtype=np.int64)
-    of_piece[number] = labels
-    return number.astype(np.int64), of_piece
+    of_component = np.empty(n_pieces, dtype=np.int64)
+    of_component[number] = labels
+    return number.astype(np.int64), of_component
 
 
 def _dual(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     weight: float | None,
 ) -> Dual:  # fmt: skip
-    assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no shares of any label"
+    assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no fraction of any label"
     n = points.shape[1]
-    size, around = np.abs(volumes(points, cells)), rings(cells, len(points))
+    size, around = np.abs(volumes(points, cells)), stars(cells, len(points))
     scale = np.add.reduceat(np.append(size[around.cells], 0.0), around.start[:-1]) / np.maximum(
         np.diff(around.start), 1
     )
@@ -168,7 +169,7 @@ def _dual(
     if weight is None:
         # The edge of a regular cell of that volume: thin cells do not make a surface dear.
         edge = (size * (6.0 * np.sqrt(2.0) if n == 3 else 4.0 / np.sqrt(3.0))) ** (1.0 / n)
-        tension = TENSION_SHARE * 0.5 * (edge[:, None] + edge[across])
+        tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
     tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
     voxel = size.sum() / counts.sum()
     return Dual(
@@ -261,7 +262,7 @@ def _settle_once(dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: I
         if room[old] < dual.size[cell] and _voxels(dual, cell, new) < _voxels(dual, cell, old):
             continue
         if is_careful and not keeps_topology(
-            dual.cells, dual.across, labels, dual.ring_start, dual.ring_cells, cell, new
+            dual.cells, dual.across, labels, dual.star_start, dual.star_cells, cell, new
         ):
             continue
         labels[cell] = new
@@ -275,14 +276,14 @@ def _settle_once(dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: I
 
 @unit
 def keeps_topology(
-    cells: Ints2, across: Ints2, labels: Ints1, ring_start: Ints1, ring_cells: Ints1, cell: int, label: int
+    cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int, label: int
 ) -> bool:
     """Whether a cell may have another label without changing the topology of its own label or of the new one.
 
     A simple point in a complex of simplices: of either label, what the cell shares with its other cells and what it
     shares with all that is not of it, the outside among them, are discs. Pinches are topology, too.
     """
-    rest = (cells, across, labels, ring_start, ring_cells, cell)
+    rest = (cells, across, labels, star_start, star_cells, cell)
     old = labels[cell]
     return (
         _is_disc(*rest, old, True)
@@ -294,7 +295,7 @@ def keeps_topology(
 
 @unit
 def _is_disc(
-    cells: Ints2, across: Ints2, labels: Ints1, ring_start: Ints1, ring_cells: Ints1, cell: int,
+    cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int,
     label: int, is_of: bool,
 ) -> bool:  # fmt: skip
     """Whether what a cell shares with the other cells of a label, or with those of others and the outside, is a disc.
@@ -312,8 +313,8 @@ def _is_disc(
     if n_shared == 0 or n_shared == n:
         return False
     node = cells[cell, first]
-    for r in range(ring_start[node], ring_start[node + 1]):
-        other = ring_cells[r]
+    for r in range(star_start[node], star_start[node + 1]):
+        other = star_cells[r]
         if other == cell or not _has_corners(cells, other, cell, is_shared):
             continue
         if (labels[other] == label) == is_of:
@@ -344,55 +345,59 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
 
 
 def _without_fragments(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], voxel: float, pieces: list[NDArray]
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], voxel: float, components: list[NDArray]
 ) -> int:
-    """Pieces of cells that no piece of voxels justifies are bridged or go; how many cells took another label.
+    """Components of cells that no component of voxels justifies are bridged or go; how many cells took another label.
 
-    The pieces of a label are ranked by the voxels of it that they hold. The first stays, and each further one of whose
-    rank there is a piece of voxels, not far smaller. The others are linked to one of the same label, or, where that
-    costs more than `BRIDGE_SHARE` of the voxels that are then lost, given to their neighbours cell by cell.
+    The components of a label are ranked by the voxels of it that they hold. The first stays, and each further one of
+    whose rank there is a component of voxels, not far smaller. The others are linked to one of the same label, or,
+    where that costs more than `BRIDGE_RATIO` of the voxels that are then lost, given to their neighbours cell by cell.
     """
-    number, of_piece = pieces_of(dual.across, labels)
+    number, of_component = components_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     is_own = dual.row == labels[cell]
-    content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_piece))
+    content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_component))
     # What a cell would hold of the best other label: at most so much is lost if it goes.
     others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
-    most = BRIDGE_SHARE * (content - np.bincount(number, others, len(of_piece)))
-    order = np.lexsort((np.arange(len(of_piece)), -content, of_piece))
-    rank = np.empty(len(of_piece), dtype=np.int64)
-    rank[order] = np.arange(len(of_piece)) - np.searchsorted(of_piece[order], of_piece[order])
-    ranked = zip(of_piece, rank, content, strict=True)
-    stays = [k == 0 or (k < len(pieces[p]) and voxel * pieces[p][k] >= PIECE_SHARE * c) for p, k, c in ranked]
+    most = BRIDGE_RATIO * (content - np.bincount(number, others, len(of_component)))
+    order = np.lexsort((np.arange(len(of_component)), -content, of_component))
+    rank = np.empty(len(of_component), dtype=np.int64)
+    rank[order] = np.arange(len(of_component)) - np.searchsorted(of_component[order], of_component[order])
+    ranked = zip(of_component, rank, content, strict=True)
+    stays = [
+        k == 0 or (k < len(components[p]) and voxel * components[p][k] >= COMPONENT_FRACTION * c) for p, k, c in ranked
+    ]
     is_loose, moved = ~np.array(stays)[number], 0
     way, before, bridge = np.full(len(labels), np.inf), np.empty_like(labels), np.empty_like(labels)
-    for piece in order[~np.array(stays)[order]]:
-        if (labels[number == piece] != of_piece[piece]).any():  # another bridge goes over it
+    for component in order[~np.array(stays)[order]]:
+        if (labels[number == component] != of_component[component]).any():  # another bridge goes over it
             continue
-        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == piece), most[piece])
-        n_of, n_taken = (np.bincount(of, minlength=len(pieces)) for of in (labels, labels[bridge[:count]]))
+        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == component), most[component])
+        n_of, n_taken = (np.bincount(of, minlength=len(components)) for of in (labels, labels[bridge[:count]]))
         if count > 0 and ((n_taken == 0) | (n_taken < n_of)).all():  # no label goes for it
-            labels[bridge[:count]] = of_piece[piece]
-            is_loose[bridge[:count]] = is_loose[number == piece] = False
+            labels[bridge[:count]] = of_component[component]
+            is_loose[bridge[:count]] = is_loose[number == component] = False
             is_bridge[bridge[:count]] = True
             moved += count
     return moved + _give_away(dual, labels, is_loose)
 
 
 @entry
-def _bridge(bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints1, piece: Ints1, most: float) -> int:
-    """The cells by which a piece is linked to another of its label at least cost, below `most`; how many there are.
+def _bridge(
+    bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints1, component: Ints1, most: float
+) -> int:
+    """The cells by which a component is linked to another of its label at least cost, below `most`; how many there are.
 
     Dijkstra's shortest path: a step costs what it costs that its cell has the label, all others as they are. `way` is
     infinite before and after.
     """
-    label, end, count = labels[piece[0]], -1, 0
-    heap = [(0.0, piece[0])]
-    for cell in piece:
+    label, end, count = labels[component[0]], -1, 0
+    heap = [(0.0, component[0])]
+    for cell in component:
         way[cell], before[cell] = 0.0, -1
-        if cell != piece[0]:
+        if cell != component[0]:
             heapq.heappush(heap, (0.0, cell))
-    done = [piece[0] for _ in range(0)]
+    done = [component[0] for _ in range(0)]
     while len(heap) > 0 and end < 0:
         so_far, cell = heapq.heappop(heap)
         if so_far > way[cell]:
@@ -416,7 +421,7 @@ def _bridge(bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints
         count += 1
     for cell in done:
         way[cell] = np.inf
-    for cell in piece:
+    for cell in component:
         way[cell] = np.inf
     return count
 
@@ -457,7 +462,7 @@ class _Work(NamedTuple):
 
 
 def _work(dual: Dual) -> _Work:
-    widest = int(np.diff(dual.ring_start).max())
+    widest = int(np.diff(dual.star_start).max())
     place, seen = (np.full(len(array), -1, dtype=np.int64) for array in (dual.cells, dual.scale))
     return _Work(np.empty(widest, dtype=np.int64), np.empty(widest + 1, dtype=np.int64), place, seen)
 
@@ -503,9 +508,9 @@ def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
     """Whether cells of two labels meet at each node."""
     is_mixed = np.zeros(len(dual.scale), dtype=np.bool_)
     for node in range(len(is_mixed)):
-        first, last = dual.ring_start[node], dual.ring_start[node + 1]
+        first, last = dual.star_start[node], dual.star_start[node + 1]
         for r in range(first + 1, last):
-            if labels[dual.ring_cells[r]] != labels[dual.ring_cells[first]]:
+            if labels[dual.star_cells[r]] != labels[dual.star_cells[first]]:
                 is_mixed[node] = True
                 break
     return is_mixed
@@ -522,9 +527,9 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
         if excess > 0:
             faces[count, 0], faces[count, 1], faces[count, 2] = a, -1, n_labels
             count += 1
-        for r in range(dual.ring_start[a], dual.ring_start[a + 1] if dual.cells.shape[1] == 4 else 0):
+        for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
             for k in range(4):
-                b = dual.cells[dual.ring_cells[r], k]
+                b = dual.cells[dual.star_cells[r], k]
                 if b <= a or not is_mixed[b] or work.seen[b] == a or not (is_near[a] or is_near[b]):
                     continue
                 work.seen[b] = a
@@ -539,9 +544,9 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
 def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
     """The cells around a node, or around an edge with b >= 0, and how many they are."""
     count = 0
-    for r in range(dual.ring_start[a], dual.ring_start[a + 1]):
-        if b < 0 or has_node(dual.cells, dual.ring_cells[r], b):
-            star[count] = dual.ring_cells[r]
+    for r in range(dual.star_start[a], dual.star_start[a + 1]):
+        if b < 0 or has_node(dual.cells, dual.star_cells[r], b):
+            star[count] = dual.star_cells[r]
             count += 1
     return count
 

@@ -26,11 +26,11 @@ GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
 # A mesh that follows the image already has a small E_D to be measured by. With 0.02 pytetwild's of MNI152 and of a CT
 # get better in E_D, mean and 1st percentile of rho and smallest angle alike; with 0.05 MNI152's 165 slivers become 552.
 START_K_D = 0.02
-SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the floor at the uniform k_D
-MIN_DIHEDRAL = 12.0  # degrees: the floor
+SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the minimum at the uniform k_D
+MIN_DIHEDRAL = 12.0  # degrees: the smallest dihedral angle of a cell
 # The longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are seven times fewer
 # cells, and the displacement suffers sooner from those that grow where the image is uniform.
-QUADRATIC_SHARE = 1.15
+QUADRATIC_RATIO = 1.15
 QUADRATIC_GRADATION = 0.5  # of sizes, likewise: gentler changes lower the displacement's error and the interfaces'
 E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
 
@@ -113,9 +113,9 @@ class MeshingResult(NamedTuple):
         For the optimisations, likewise.
     labels : (M,) int64, optional
         Label of each cell, of a content with memberships.
-    missed : mapping of str to str
-        What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
-    share : float, optional
+    violated : mapping of str to str
+        The requirements that the mesh violates, by name, a sentence each (`tetopt.engine.requirements`); empty if none.
+    fraction : float, optional
         Of the content's variance, that is left in the cells: E_D over variance times volume. Of `mesh_image` alone.
     n_dropped : int
         Connected components that were left out of the mesh, since the mask does not have them.
@@ -124,7 +124,7 @@ class MeshingResult(NamedTuple):
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> result = tetopt.mesh_image(image, 300, iterations=8)
-    >>> len(result.mesh.points), result.ended, len(result.missed)
+    >>> len(result.mesh.points), result.ended, len(result.violated)
     (300, 'iterations', 0)
     >>> result.history[-1].E < result.history[0].E
     True
@@ -138,8 +138,8 @@ class MeshingResult(NamedTuple):
     seconds_start: float = 0.0
     seconds_run: float = 0.0
     labels: NDArray[np.int64] | None = None
-    missed: Mapping[str, str] = MappingProxyType({})
-    share: float | None = None
+    violated: Mapping[str, str] = MappingProxyType({})
+    fraction: float | None = None
     n_dropped: int = 0
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
@@ -178,13 +178,13 @@ class MeshingResult(NamedTuple):
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""
         last, mesh = self.history[-1], self.mesh
-        share = "" if self.share is None else f", {self.share:.4g} of the variance is left within cells"
+        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is left within cells"
         rows = [
             ("E", f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations ({self.ended})"),
-            ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{share}"),
+            ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{fraction}"),
             ("time", f"{self.seconds_start + (self.seconds_run or last.seconds):.1f} s"),
             *notebook.mesh_rows(mesh.points, mesh.cells),
-            *(("misses", f"{name}: {words}") for name, words in self.missed.items()),
+            *(("violates", f"{name}: {words}") for name, words in self.violated.items()),
         ]
         return notebook.card_html("MeshingResult", rows, notebook.section_html(mesh.points, mesh.cells))
 

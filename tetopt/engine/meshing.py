@@ -24,14 +24,14 @@ from tetopt.engine.loop import (
     GRADED_ITERATIONS,
     GRADED_K_D,
     QUADRATIC_GRADATION,
-    QUADRATIC_SHARE,
+    QUADRATIC_RATIO,
     START_K_D,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.promises import requested
+from tetopt.engine.requirements import requested
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -92,12 +92,12 @@ def mesh_image(
         (`tetopt.content`).
     nodes : int
         Number of nodes, of order 2 with those in the middle of edges. A graded mesh meets it (of order 2 to 1 %) unless
-        the run is cut short, k_D is 0, cells have to be lifted over the floor, or no more nodes can be taken out; count
-        them. Without it and `target_error`, as many as `sizes` take that have a target everywhere.
+        the run is cut short, k_D is 0, cells have to be lifted above the minimum dihedral angle, or no more nodes can
+        be taken out; count them. Without it and `target_error`, as many as `sizes` take that have a target everywhere.
     target_error : float
-        Instead of `nodes`, of a graded mesh: the share of the image's variance that may be left within cells, 0 to 1;
-        as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
-        says so in `missed`.
+        Instead of `nodes`, of a graded mesh: the fraction of the image's variance that may be left within cells, 0 to
+        1; as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
+        says so in `violated`.
     mode : {"graded", "uniform", "paper", "start"}
         "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`, cut
         off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box.
@@ -130,8 +130,9 @@ def mesh_image(
     -------
     MeshingResult
         As `optimize`; its first record is of the initial mesh, which it holds, too. A run that could not keep all that
-        it promises returns its mesh nevertheless, and says so in `missed`: empty if it did, else a sentence by name
-        (`floor`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see `tetopt.engine.promises`).
+        its requirements are returns its mesh nevertheless, and says so in `violated`: empty if it did, else a sentence
+        by name (`min_dihedral`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see
+        `tetopt.engine.requirements`).
 
     Raises
     ------
@@ -153,7 +154,7 @@ def mesh_image(
     >>> result = tetopt.mesh_image(image, 300)
     >>> uniform = tetopt.mesh_image(image, 300, mode="uniform")
     >>> ratio = tetopt.E_D(image, uniform.mesh) / tetopt.E_D(image, result.mesh)
-    >>> len(result.mesh.points), dict(result.missed), ratio > 100
+    >>> len(result.mesh.points), dict(result.violated), ratio > 100
     (300, {}, True)
 
     As many nodes as an error takes, here a fifth of the image's variance:
@@ -233,9 +234,9 @@ def bytes_of(content: Content, nodes: int) -> float:
 
 
 def check_target_error(target_error: float) -> None:
-    """InputError for an error that is no share."""
+    """InputError for an error that is no fraction."""
     if not 0.0 < target_error < 1.0:
-        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
+        raise InputError(f"target_error: expected a fraction of the image's variance, 0 to 1, got {target_error}")
 
 
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
@@ -258,8 +259,8 @@ def _check_names(options: dict[str, Any], optimisation: Run) -> None:
 
 def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
     """As many nodes, of order 2 in all, as the sizes take if they say so everywhere."""
-    needed, share = nodes_of_sizes(content, sizes)
-    if share < 1.0:
+    needed, fraction = nodes_of_sizes(content, sizes)
+    if fraction < 1.0:
         return None
     return round(needed * (QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0))
 
@@ -271,9 +272,9 @@ def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int
     if order not in (1, 2):
         raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     names = [name for name, value in values.items() if value is not None]
-    if strange := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
+    if unknown := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])
-        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {takes}, but no {strange[0]}")
+        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {takes}, but no {unknown[0]}")
     if mode == "graded" and ("nodes" in names) == ("target_error" in names):
         raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
     if mode in ("uniform", "paper") and ("nodes" in names) == ("spacing" in names):
@@ -290,7 +291,7 @@ def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, ord
         return sizes
     sizes = Sizes() if sizes is None else sizes
     if sizes.coarsest is None:
-        sizes = sizes._replace(coarsest=QUADRATIC_SHARE)
+        sizes = sizes._replace(coarsest=QUADRATIC_RATIO)
     if sizes.gradation is None:
         sizes = sizes._replace(gradation=QUADRATIC_GRADATION)
     if nodes is None:
@@ -323,7 +324,7 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
 def meshed_to_error(
     image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], MeshingResult]
 ) -> MeshingResult:
-    """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
+    """Run after run with other numbers of nodes, until the fraction of the image's variance is just below a target.
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that has the error; if
     none has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from
@@ -333,7 +334,7 @@ def meshed_to_error(
     Raises
     ------
     InputError
-        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree_mesh`.
+        A fraction out of range, or one below that of the image's noise, which no mesh should follow; as `octree_mesh`.
     """
     check_target_error(target_error)
     content = plain(image)
@@ -343,11 +344,11 @@ def meshed_to_error(
     noise = content.noise * content.unit / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
+            f"target_error: {target_error:g} of the variance is below the noise's fraction, by estimate {noise:.3g}: "
             "cells would have to follow the noise; ask for more, or denoise the image"
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
-    nodes, shares = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
+    nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
     results: list[MeshingResult] = []
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
@@ -360,47 +361,47 @@ def meshed_to_error(
             break
         requests.add(nodes)
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
-        count, share = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
+        count, fraction = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
         if result.ended in CUT_SHORT:
-            reached = [each for each in results if shares[len(each.mesh.points)] <= target_error]
-            return _best(reached, shares, target_error) if reached else result
-        if count in shares:
+            reached = [each for each in results if fractions[len(each.mesh.points)] <= target_error]
+            return _best(reached, fractions, target_error) if reached else result
+        if count in fractions:
             break
-        shares[count] = share
+        fractions[count] = fraction
         results.append(result)
-        if ERROR_REACHED * target_error <= share <= target_error:
+        if ERROR_REACHED * target_error <= fraction <= target_error:
             return result
-        nodes = _next_nodes(content.image, shares, target_error)
-        if nodes in shares:
+        nodes = _next_nodes(content.image, fractions, target_error)
+        if nodes in fractions:
             break
-    return _best(results, shares, target_error)
+    return _best(results, fractions, target_error)
 
 
-def _best(results: list[MeshingResult], shares: dict[int, float], target: float) -> MeshingResult:
+def _best(results: list[MeshingResult], fractions: dict[int, float], target: float) -> MeshingResult:
     """The first of the results than which none is better."""
     best = results[0]
     for result in results[1:]:
-        if _is_better(len(result.mesh.points), len(best.mesh.points), shares, target):
+        if _is_better(len(result.mesh.points), len(best.mesh.points), fractions, target):
             best = result
     return best
 
 
-def _is_better(new: int, old: int, shares: dict[int, float], target: float) -> bool:
+def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:
     """Whether one number of nodes answers better than another: it has the error with fewer, or is nearer to it."""
-    if (shares[new] <= target) != (shares[old] <= target):
-        return shares[new] <= target
-    return new < old if shares[new] <= target else shares[new] < shares[old]
+    if (fractions[new] <= target) != (fractions[old] <= target):
+        return fractions[new] <= target
+    return new < old if fractions[new] <= target else fractions[new] < fractions[old]
 
 
-def _next_nodes(image: Image, shares: dict[int, float], target: float) -> int:
+def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int:
     """The number of nodes to try next: between the nearest two on either side, or beyond the nearest."""
     aim = 0.5 * (1.0 + ERROR_REACHED) * target
-    above = max((n for n, share in shares.items() if share > target), default=None)
-    below = min((n for n, share in shares.items() if share <= target), default=None)
+    above = max((n for n, fraction in fractions.items() if fraction > target), default=None)
+    below = min((n for n, fraction in fractions.items() if fraction <= target), default=None)
     least = 0.03 * aim  # there may be no error at all
     if above is not None and below is not None and above < below:
-        part = np.log(shares[above] / aim) / np.log(shares[above] / max(shares[below], least))
+        part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
         return int(above * (below / above) ** part)
-    nearest = min(shares) if above is None else above
-    ratio = max(shares[nearest], least) / aim
+    nearest = min(fractions) if above is None else above
+    ratio = max(fractions[nearest], least) / aim
     return int(np.clip(nearest * ratio ** (1.0 / ERROR_RATE), 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))

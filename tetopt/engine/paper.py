@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.check import filled_share
+from tetopt.check import filled_fraction
 from tetopt.contents.content import plain
 from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import SamplingGrid, from_ticks, moment_sums, orientations, sampling_grid
-from tetopt.engine.complex import State, build, cell_squares, node_rings
+from tetopt.engine.complex import State, build, cell_squares, node_stars
 from tetopt.engine.loop import (
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
@@ -26,7 +26,7 @@ from tetopt.engine.loop import (
     side_ticks,
 )
 from tetopt.engine.paper_moves import Moves, descend, relocate
-from tetopt.engine.promises import promised
+from tetopt.engine.requirements import checked
 from tetopt.engine.state import unweighted, weighted
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
@@ -160,7 +160,7 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
-    return promised(MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh)
+    return checked(MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh)
 
 
 def _cells(state: State) -> NDArray[np.int64]:
@@ -195,7 +195,7 @@ def _check_fills_box(image: Image, mesh: Mesh) -> None:
     index = image.to_index(mesh.points)
     extent = np.column_stack([index.min(axis=0), index.max(axis=0)])
     is_box = np.abs(extent - box_sides(image.shape)).max() <= ON_SIDE_VOXELS
-    if not is_box or abs(filled_share(mesh, image) - 1.0) > 1e-9:
+    if not is_box or abs(filled_fraction(mesh, image) - 1.0) > 1e-9:
         raise InputError(
             "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
             'pass retessellate="never" to keep the connectivity'
@@ -250,11 +250,11 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
 
 def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bool]) -> bool:
     """Move every node once; False if `is_over` cut it short, between two colours."""
-    rings, cells = node_rings(state), _cells(state)
-    colours = greedy_colours(cells, rings.start, rings.cells)
+    stars, cells = node_stars(state), _cells(state)
+    colours = greedy_colours(cells, stars.start, stars.cells)
     is_free = ~state.complex.is_frozen[:, 4 - cells.shape[1] : 3].all(axis=1)
     move = relocate if k_D == 0.0 else descend
-    laid_out = packed(state), packed(rings)
+    laid_out = packed(state), packed(stars)
     for colour in range(colours.max() + 1):
         if is_over():
             return False

@@ -1,7 +1,7 @@
 """The two moves of the paper's scheme: descent with numerical derivatives, and Lloyd's relocation.
 
 Nodes of one colour share no cell and move at the same time, so the result does not depend on the threads. A node moves
-only if no cell of its ring loses its orientation (exactly, in integers) and the ring's energy falls. The state's shape
+only if no cell of its star loses its orientation (exactly, in integers) and the star's energy falls. The state's shape
 energy is E_G, measured as `tetopt.energy.geometric` measures it.
 """
 
@@ -14,29 +14,29 @@ from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
 from tetopt.energy.sampling import cell_orientation, few_threads
-from tetopt.engine.complex import FLAT_SHARE, NodeRings, State, cell_energy
-from tetopt.engine.smooth import Trial, TrialByValue, ring_image, store, trial_of
+from tetopt.engine.complex import FLAT_FRACTION, NodeStars, State, cell_energy
+from tetopt.engine.smooth import Trial, TrialByValue, star_image, store, trial_of
 from tetopt.engine.surface import projection_at
 from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
 from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 
-LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy: then the node stays
+LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the star's energy: then the node stays
 
 
 class Moves(NamedTuple):
     """The nodes of one colour, and what their moves read and write."""
 
     state: State
-    rings: NodeRings
+    stars: NodeStars
     nodes: Ints1
     step_ratio: float  # step length of the descent over the distance to the nearest cell centroid
 
 
 def descend(moves: Moves) -> None:
-    """Move nodes along the image's axes to lower the energy of their rings (Section 2.2).
+    """Move nodes along the image's axes to lower the energy of their stars (Section 2.2).
 
-    Per axis the ring's energy is measured at one step forwards and backwards, the step a ratio of the distance to
-    the nearest centroid of the ring's cells; the vertex of the parabola through the three values is tried as well;
+    Per axis the star's energy is measured at one step forwards and backwards, the step a ratio of the distance to
+    the nearest centroid of the star's cells; the vertex of the parabola through the three values is tried as well;
     the best of them is taken if it lies below the present energy.
     """
     with few_threads(len(moves.nodes) * 100):
@@ -44,9 +44,9 @@ def descend(moves: Moves) -> None:
 
 
 def relocate(moves: Moves) -> None:
-    """Move nodes to the minimisers of E_G over their rings (Section 2.1), the objective's weights being 1 and 0.
+    """Move nodes to the minimisers of E_G over their stars (Section 2.1), the objective's weights being 1 and 0.
 
-    Inside, that is the volume-weighted mean of the ring's circumcentres. A node on a face or an edge of the box
+    Inside, that is the volume-weighted mean of the star's circumcentres. A node on a face or an edge of the box
     goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
     times, then left out. Sums and fluxes are not kept up.
     """
@@ -72,18 +72,18 @@ def _shape(x: NDArray, state: State, cell: int) -> float:
     _load_cell(x, state, cell)
     volume, E_G = volume_and_E_G(x, n_corners)
     squares = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
-    return np.inf if volume <= FLAT_SHARE * squares ** (0.5 * (n_corners - 1)) else E_G
+    return np.inf if volume <= FLAT_FRACTION * squares ** (0.5 * (n_corners - 1)) else E_G
 
 
 @unit
-def _ring_energy(trial: TrialByValue, limit: float, node: int, state: State, rings: NodeRings) -> float:
-    """Energy of a node's ring as the ticks stand; what is measured goes to `trial`.
+def _star_energy(trial: TrialByValue, limit: float, node: int, state: State, stars: NodeStars) -> float:
+    """Energy of a node's star as the ticks stand; what is measured goes to `trial`.
 
     Infinite if a cell is flat or inverted, or once the energy is above `limit`.
     """
-    first, energy = rings.start[node], 0.0
-    for r in range(first, rings.start[node + 1]):  # cheap refusals before any voxel is read
-        trial.shapes[r - first] = _shape(trial.x, state, rings.cells[r])
+    first, energy = stars.start[node], 0.0
+    for r in range(first, stars.start[node + 1]):  # cheap refusals before any voxel is read
+        trial.shapes[r - first] = _shape(trial.x, state, stars.cells[r])
         if trial.shapes[r - first] == np.inf:
             return np.inf
         energy += state.objective.geometry * trial.shapes[r - first]
@@ -91,38 +91,38 @@ def _ring_energy(trial: TrialByValue, limit: float, node: int, state: State, rin
         return np.inf
     if state.objective.image > 0.0:
         sums = np.empty((1, trial.fluxes.shape[2]))
-        energy, _ = ring_image(sums, trial, energy, 0.0, limit, node, state, rings)
+        energy, _ = star_image(sums, trial, energy, 0.0, limit, node, state, stars)
     return energy
 
 
 @unit
-def _nearest_centroid(x: Floats2, node: int, state: State, rings: NodeRings) -> float:
-    """Distance in mm from a node to the nearest centroid of its ring's cells."""
+def _nearest_centroid(x: Floats2, node: int, state: State, stars: NodeStars) -> float:
+    """Distance in mm from a node to the nearest centroid of its star's cells."""
     nearest, n_corners = np.inf, state.complex.cells.shape[1]
-    for r in range(rings.start[node], rings.start[node + 1]):
-        _load_cell(x, state, rings.cells[r])
+    for r in range(stars.start[node], stars.start[node + 1]):
+        _load_cell(x, state, stars.cells[r])
         squared = 0.0
         for d in range(3):
             mean = 0.0
             for k in range(n_corners):
                 mean += x[k, d] / n_corners
-            squared += (mean - x[rings.corner[r], d]) ** 2
+            squared += (mean - x[stars.corner[r], d]) ** 2
         nearest = min(nearest, squared)
     return np.sqrt(nearest)
 
 
 @unit
 def _descend(moves: Moves, number: int) -> None:
-    """Move one node along the axes in turn, wherever that lowers its ring's energy."""
-    node, state, rings = moves.nodes[number], moves.state, moves.rings
+    """Move one node along the axes in turn, wherever that lowers its star's energy."""
+    node, state, stars = moves.nodes[number], moves.state, moves.stars
     ticks, matrix, fluxes = state.complex.ticks, state.objective.matrix, state.complex.fluxes
-    size, x = rings.start[node + 1] - rings.start[node], np.empty((4, 3))
+    size, x = stars.start[node + 1] - stars.start[node], np.empty((4, 3))
     # Two trials: the best so far is in row `kept`, the next goes to the other.
     shapes, sides, kept = np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2])), 0
     energy = 0.0
-    for r in range(rings.start[node], rings.start[node + 1]):
-        energy += cell_energy(state, rings.cells[r])
-    reach = moves.step_ratio * _nearest_centroid(x, node, state, rings)
+    for r in range(stars.start[node], stars.start[node + 1]):
+        energy += cell_energy(state, stars.cells[r])
+    reach = moves.step_ratio * _nearest_centroid(x, node, state, stars)
     for axis in range(4 - state.complex.cells.shape[1], 3):
         length = np.sqrt(matrix[0, axis] ** 2 + matrix[1, axis] ** 2 + matrix[2, axis] ** 2)
         step = np.int64(np.rint(reach / (length * 2.0**-state.objective.bits)))
@@ -145,7 +145,7 @@ def _descend(moves: Moves, number: int) -> None:
                 if there == here:
                     break
             ticks[node, axis] = there
-            value = _ring_energy(Trial(x, shapes[1 - kept], sides[1 - kept]), limit, node, state, rings)
+            value = _star_energy(Trial(x, shapes[1 - kept], sides[1 - kept]), limit, node, state, stars)
             if attempt == 0:
                 forwards = value
             elif attempt == 1:
@@ -155,33 +155,33 @@ def _descend(moves: Moves, number: int) -> None:
         ticks[node, axis] = best_there
         if best_there != here:
             energy = best
-            store(Trial(x, shapes[kept], sides[kept]), node, state, rings)
+            store(Trial(x, shapes[kept], sides[kept]), node, state, stars)
 
 
 @unit
 def _relocate(moves: Moves, number: int) -> None:
-    """Move one node to the minimiser of its ring's E_G, or as far towards it as no cell is inverted."""
-    node, state, rings = moves.nodes[number], moves.state, moves.rings
-    ticks, n_corners, trial = state.complex.ticks, state.complex.cells.shape[1], trial_of(state, rings, node)
-    weight, gradient, energy, ring_volume = 1.0 / (n_corners * (n_corners + 1)), np.zeros(3), 0.0, 0.0
-    for r in range(rings.start[node], rings.start[node + 1]):
-        _load_cell(trial.x, state, rings.cells[r])
+    """Move one node to the minimiser of its star's E_G, or as far towards it as no cell is inverted."""
+    node, state, stars = moves.nodes[number], moves.state, moves.stars
+    ticks, n_corners, trial = state.complex.ticks, state.complex.cells.shape[1], trial_of(state, stars, node)
+    weight, gradient, energy, star_volume = 1.0 / (n_corners * (n_corners + 1)), np.zeros(3), 0.0, 0.0
+    for r in range(stars.start[node], stars.start[node + 1]):
+        _load_cell(trial.x, state, stars.cells[r])
         volume, E_G = volume_and_E_G(trial.x, n_corners)
-        edges, slope = E_G / (volume * weight), volume_gradient(trial.x, rings.corner[r], n_corners)
+        edges, slope = E_G / (volume * weight), volume_gradient(trial.x, stars.corner[r], n_corners)
         apart = (0.0, 0.0, 0.0)
         for k in range(n_corners):
-            apart = minus(apart, difference(trial.x, k, rings.corner[r]))
+            apart = minus(apart, difference(trial.x, k, stars.corner[r]))
         for d in range(3):
             gradient[d] += weight * (slope[d] * edges + 2.0 * volume * apart[d])
-        ring_volume += volume
-        energy += state.complex.E_shape[rings.cells[r]]
-    # E_G over the ring is |Omega| / (n+1) |x - minimiser|^2 + constant.
+        star_volume += volume
+        energy += state.complex.E_shape[stars.cells[r]]
+    # E_G over the star is |Omega| / (n+1) |x - minimiser|^2 + constant.
     step, here = times(projection_at(state, node), gradient), row(ticks, node)
-    step = scaled(-n_corners / (2.0 * ring_volume), step)
+    step = scaled(-n_corners / (2.0 * star_volume), step)
     for halving in range(LLOYD_HALVINGS + 1):
         for d in range(3):
             ticks[node, d] = here[d] + np.int64(np.rint(step[d] * 0.5**halving / 2.0**-state.objective.bits))
-        if _ring_energy(trial, np.inf, node, state, rings) < energy:
-            store(trial, node, state, rings)
+        if _star_energy(trial, np.inf, node, state, stars) < energy:
+            store(trial, node, state, stars)
             return
     put_row(ticks, node, here)

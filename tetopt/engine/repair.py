@@ -1,8 +1,8 @@
-"""The floor on the dihedral angles: the worst cells mended one by one, whatever it does to E.
+"""The minimum dihedral angle: the worst cells mended one by one, whatever it does to E.
 
 Moves are those of `tetopt.engine.flips` and `tetopt.engine.density` and displacements of single nodes, but judged
 by the smallest dihedral angle of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch
-1997), and of the moves of a cell the one that leaves the best worst angle, up to the floor.
+1997), and of the moves of a cell the one that leaves the best worst angle, up to the minimum.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import (
-    NodeRings,
+    NodeStars,
     State,
     cell_cosine,
     facet_of,
     grown,
     is_interface,
     load_cell,
-    node_rings,
+    node_stars,
     outward,
     tet_cosine,
 )
@@ -40,14 +40,14 @@ from tetopt.engine.flips import (
     ring_of_edge,
     turn_to_arcs,
 )
-from tetopt.engine.smooth import ring_energy, slid, store, trial_of
+from tetopt.engine.smooth import slid, star_energy, store, trial_of
 from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
 from tetopt.system.kernels import Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
 STEP_HALVINGS = 7  # of a node's displacement
-FIRST_STEP_EDGES = 0.25  # of the ring's mean edge: the first displacement
+FIRST_STEP_EDGES = 0.25  # of the star's mean edge: the first displacement
 WORST_WEIGHT = 40.0  # a steep sum stands for the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
 
 
@@ -56,7 +56,7 @@ class Repaired(NamedTuple):
 
     state: State
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
-    n_below: int  # cells still under the floor
+    n_below: int  # cells still below the minimum
     n_moves: int
 
 
@@ -74,13 +74,13 @@ def _fill_cosines(cosines: Floats1, state: State) -> None:
         cosines[cell] = cell_cosine(x, state, cell)
 
 
-def repair(state: State, floor: float) -> Repaired:
-    """Lift every cell's smallest dihedral angle to `floor`, degrees, as far as moves can.
+def repair(state: State, min_dihedral: float) -> Repaired:
+    """Lift every cell's smallest dihedral angle to `min_dihedral`, degrees, as far as moves can.
 
     Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
     put in or taken out; until no cell is left, or a round changes nothing.
     """
-    target = -np.cos(np.radians(floor))
+    target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
     for _ in range(REPAIR_ROUNDS):
         bad = _worst_first(state, target)
@@ -91,14 +91,14 @@ def repair(state: State, floor: float) -> Repaired:
         n_made = _reconnect(state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2]))
         bad = _worst_first(state, target)
         if len(bad):
-            n_made += _displace(state, node_rings(state), bad, target)
+            n_made += _displace(state, node_stars(state), bad, target)
         bad = _worst_first(state, target)
         if n_made == 0 and len(bad):
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)
         if n_made == 0 and len(bad):  # nodes between labels may leave the surfaces that they lie on
-            n_made = _displace(_released(state), node_rings(state), bad, target)
+            n_made = _displace(_released(state), node_stars(state), bad, target)
         n_moves += n_made
         if n_made == 0:
             break
@@ -110,9 +110,9 @@ def _released(state: State) -> State:
     return state._replace(complex=state.complex._replace(meeting=np.full_like(state.complex.meeting, -1)))
 
 
-def n_cells_below(state: State, floor: float) -> int:
-    """How many cells have a smallest dihedral angle under `floor` degrees."""
-    return int((cell_cosines(state) < -np.cos(np.radians(floor))).sum())
+def n_cells_below(state: State, min_dihedral: float) -> int:
+    """How many cells have a smallest dihedral angle under `min_dihedral` degrees."""
+    return int((cell_cosines(state) < -np.cos(np.radians(min_dihedral))).sum())
 
 
 def _worst_first(state: State, target: float) -> NDArray[np.int64]:
@@ -225,24 +225,24 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
 
 
 @entry
-def _displace(state: State, rings: NodeRings, bad: Ints1, target: float) -> int:
-    """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
+def _displace(state: State, stars: NodeStars, bad: Ints1, target: float) -> int:
+    """Move the nodes of each bad cell so that the worst angle of their stars grows, up to the target."""
     x, n_made = np.empty((4, 3)), 0
     for number in range(len(bad)):
         for k in range(4):
             if cell_cosine(x, state, bad[number]) >= target:
                 break
-            if _lift(x, state, rings, state.complex.cells[bad[number], k], target):
+            if _lift(x, state, stars, state.complex.cells[bad[number], k], target):
                 n_made += 1
     return n_made
 
 
 @unit
-def _ring_cosine(x: Floats2, state: State, rings: NodeRings, node: int, least: float) -> float:
-    """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
+def _star_cosine(x: Floats2, state: State, stars: NodeStars, node: int, least: float) -> float:
+    """The worst of a star's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
     worst = 1.0
-    for r in range(rings.start[node], rings.start[node + 1]):
-        c = state.complex.cells[rings.cells[r]]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        c = state.complex.cells[stars.cells[r]]
         worst = min(worst, tet_cosine(x, state, c[0], c[1], c[2], c[3]))
         if worst < least:
             return worst
@@ -250,35 +250,35 @@ def _ring_cosine(x: Floats2, state: State, rings: NodeRings, node: int, least: f
 
 
 @unit
-def _lift(x: Floats2, state: State, rings: NodeRings, node: int, target: float) -> bool:
-    """Search around a node, with ever smaller steps, for a place where its ring's worst angle is larger."""
-    start, before = row(state.complex.ticks, node), _ring_cosine(x, state, rings, node, -3.0)
+def _lift(x: Floats2, state: State, stars: NodeStars, node: int, target: float) -> bool:
+    """Search around a node, with ever smaller steps, for a place where its star's worst angle is larger."""
+    start, before = row(state.complex.ticks, node), _star_cosine(x, state, stars, node, -3.0)
     if before >= target:
         return False
-    best, step, normal = before, _first_step(x, state, rings, node), np.zeros((7, 3))
+    best, step, normal = before, _first_step(x, state, stars, node), np.zeros((7, 3))
     is_sliding = slides(normal, state, node)
     for _ in range(STEP_HALVINGS):
         is_better = True
         while is_better and best < target:
-            cosine = _step_around(x, normal, is_sliding, state, rings, node, step, best)
+            cosine = _step_around(x, normal, is_sliding, state, stars, node, step, best)
             is_better, best = cosine > best, cosine
         step *= 0.5
     if best > before:
-        trial = trial_of(state, rings, node)
-        if np.isfinite(ring_energy(trial, np.inf, -1.0, node, state, rings, -1)):
-            store(trial, node, state, rings)
+        trial = trial_of(state, stars, node)
+        if np.isfinite(star_energy(trial, np.inf, -1.0, node, state, stars, -1)):
+            store(trial, node, state, stars)
             return True
     put_row(state.complex.ticks, node, start)
     return False
 
 
 @helper
-def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
+def _first_step(x: NDArray, state: State, stars: NodeStars, node: int) -> float:
     """A quarter of the mean length of the edges from a node, each as often as cells have it, mm."""
     total, count = 0.0, 0
-    for r in range(rings.start[node], rings.start[node + 1]):
-        load_cell(x, state.complex.ticks, state.complex.cells, rings.cells[r], state.objective)
-        at = rings.corner[r]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        load_cell(x, state.complex.ticks, state.complex.cells, stars.cells[r], state.objective)
+        at = stars.corner[r]
         for k in range(4):
             if k != at:
                 edge = difference(x, k, at)
@@ -289,9 +289,9 @@ def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
 
 @unit
 def _step_around(
-    x: Floats2, normal: Floats2, is_sliding: bool, state: State, rings: NodeRings, node: int, step: float, best: float
+    x: Floats2, normal: Floats2, is_sliding: bool, state: State, stars: NodeStars, node: int, step: float, best: float
 ) -> float:
-    """Move a node by a step, mm, in the one of 26 directions that leaves its ring's best cosine; that, or `best`."""
+    """Move a node by a step, mm, in the one of 26 directions that leaves its star's best cosine; that, or `best`."""
     t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits
     here = row(t, node)
     there = here
@@ -303,9 +303,9 @@ def _step_around(
         t[node, 0] = here[0] + np.int64(np.rint(way[0]))
         t[node, 1] = here[1] + np.int64(np.rint(way[1]))
         t[node, 2] = here[2] + np.int64(np.rint(way[2]))
-        if is_sliding and not slid(normal, state, rings, node):
+        if is_sliding and not slid(normal, state, stars, node):
             continue
-        cosine = _ring_cosine(x, state, rings, node, best)
+        cosine = _star_cosine(x, state, stars, node, best)
         if cosine > best + LEAST_LIFT_COSINE:
             best, there = cosine, row(t, node)
     put_row(t, node, there)

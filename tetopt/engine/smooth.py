@@ -1,4 +1,4 @@
-"""Moving nodes by Newton steps on the E of their rings, groups of one colour at a time.
+"""Moving nodes by Newton steps on the E of their stars, groups of one colour at a time.
 
 The shape energy's derivative is in closed form. That of E_D, connectivity fixed, needs only the facets around the
 node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
@@ -6,9 +6,9 @@ over their facets, phi_a the node's hat function and n the outward normal; hbar'
 the minimiser. Two cells share a facet with opposite normals, so what counts is (h - hbar_j)^2 - (h - hbar_i)^2.
 The second derivative of the shape energy is exact; of E_D's it is the part in which h changes across the facets.
 
-Groups of nodes of one colour share no cell, so each is worked on, and its rings rewritten, at the same time as the
-others; the result does not depend on the threads. A move is made only if no cell of the ring loses its orientation
-(exactly, in integers) and the ring's measured energy falls, so E never rises.
+Groups of nodes of one colour share no cell, so each is worked on, and its stars rewritten, at the same time as the
+others; the result does not depend on the threads. A move is made only if no cell of the star loses its orientation
+(exactly, in integers) and the star's measured energy falls, so E never rises.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
-    NodeRings,
+    NodeStars,
     Objective,
     State,
     cell_energy,
     cell_value,
-    cosine_up_to_floor,
+    cosine_up_to_limit,
     determinant_and_squares,
     facet_area,
     has_node,
@@ -50,8 +50,8 @@ from tetopt.engine.surface import (
     normals_at,
     projection_at,
     put_on_surface,
-    ring_faces_up,
     slides,
+    star_faces_up,
 )
 from tetopt.geometry.topology import greedy_colours
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
@@ -74,10 +74,10 @@ from tetopt.system.kernels import (
 FACET_PARTS = 8  # most parts that a facet's edge is cut into when h is integrated over it; four times as many in 2-D
 PART_VOXELS = 3.0  # voxels between the points at which h is then taken
 FACET_ASIDE = 0.25  # how far to either side of them: E falls by less per sweep at 0.05 as at 0.5
-BEND_SHARE = 0.4  # of the image's own curvature: jumps of h end within voxels, and steps are longer than that
+BEND_FRACTION = 0.4  # of the image's own curvature: jumps of h end within voxels, and steps are longer than that
 FLAT_BEND = 1e-9  # a curvature's determinant over the product of its diagonal: below, it is nothing to divide by
-FIRST_STEP_SHARE = 0.4  # of the distance to the nearest centroid of the ring's cells: the longest first step
-AXIS_STEP_SHARE = 0.1  # of that distance: how far a stalled node looks along the axes
+FIRST_STEP_FRACTION = 0.4  # of the distance to the nearest centroid of the star's cells: the longest first step
+AXIS_STEP_FRACTION = 0.1  # of that distance: how far a stalled node looks along the axes
 BLOCK_NODES = 128  # nodes in a group, at most: what they read fits the cache
 APPROACH_TRIALS = 4  # of the way to a surface: all of it, a half, ...
 LINE_TRIALS = 2  # energies measured along the step: a third gains a twentieth of what the axes do
@@ -109,7 +109,7 @@ def blocks(ticks: NDArray[np.int64]) -> Blocks:
 
 def sweep(
     state: State,
-    rings: NodeRings,
+    stars: NodeStars,
     groups: Blocks,
     may_move: NDArray[np.bool_],
     is_over: Callable[[], bool] = lambda: False,
@@ -123,8 +123,8 @@ def sweep(
     `is_over` cut it short, between two colours.
     """
     gains = np.zeros(len(may_move)) if gains is None else gains
-    laid_out = packed(state), packed(rings), packed(groups)
-    for chosen in colours_of(state, rings, groups):
+    laid_out = packed(state), packed(stars), packed(groups)
+    for chosen in colours_of(state, stars, groups):
         if is_over():
             return False
         with few_threads(len(chosen) * BLOCK_NODES * 100):
@@ -132,32 +132,32 @@ def sweep(
     return True
 
 
-def colours_of(state: State, rings: NodeRings, groups: Blocks) -> list[NDArray[np.int64]]:
+def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[NDArray[np.int64]]:
     """The groups of each colour: none shares a cell with another of its colour."""
-    start, cells = _block_rings(groups.nodes, groups.start, rings.start, rings.cells)
+    start, cells = _block_stars(groups.nodes, groups.start, stars.start, stars.cells)
     colours = greedy_colours(groups.of_node[state.complex.cells[: state.complex.n_cells[0]]], start, cells)
     return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
 
 
 @entry
-def _block_rings(nodes: Ints1, start: Ints1, ring_start: Ints1, ring_cells: Ints1) -> tuple[Ints1, Ints1]:
-    """The cells around the nodes of each group, as `Rings`; cells may be named several times."""
+def _block_stars(nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints1) -> tuple[Ints1, Ints1]:
+    """The cells around the nodes of each group, as `Stars`; cells may be named several times."""
     first = np.zeros(len(start), dtype=np.int64)
-    cells = np.empty(len(ring_cells), dtype=np.int64)
+    cells = np.empty(len(star_cells), dtype=np.int64)
     count = 0
     for block in range(len(start) - 1):
         for at in range(start[block], start[block + 1]):
-            for r in range(ring_start[nodes[at]], ring_start[nodes[at] + 1]):
-                cells[count] = ring_cells[r]
+            for r in range(star_start[nodes[at]], star_start[nodes[at] + 1]):
+                cells[count] = star_cells[r]
                 count += 1
         first[block + 1] = count
     return first, cells
 
 
-def gradient(state: State, rings: NodeRings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives of the two weighted terms of E by every node's position, (N, 3) each, per mm: shape and image."""
     shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
-    run(_gradients, len(shape), Gradients(shape, image, state, rings))
+    run(_gradients, len(shape), Gradients(shape, image, state, stars))
     return shape, image
 
 
@@ -193,7 +193,7 @@ def _moments_of(
         return weight / parts
     f = minus(scaled(scale, row(ticks, c)), a)
     parts = min(max(int(np.sqrt(max(dot(e, e), dot(f, f))) / PART_VOXELS) + 1, 2), FACET_PARTS)
-    share = 1.0 / (parts * parts)
+    fraction = 1.0 / (parts * parts)
     for p in range(parts):
         for q in range(parts - p):
             for half in range(2):
@@ -203,13 +203,13 @@ def _moments_of(
                 t = (q + (1.0 + half) / 3.0) / parts
                 weight += 1.0 - s - t
                 at = a[0] + s * e[0] + t * f[0], a[1] + s * e[1] + t * f[1], a[2] + s * e[2] + t * f[2]
-                _add_sample(moment, prefix, at, aside, 1.0 - s - t, share)
-    return weight * share
+                _add_sample(moment, prefix, at, aside, 1.0 - s - t, fraction)
+    return weight * fraction
 
 
 @helper
-def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: float, share: float) -> None:
-    """Add a share of phi h and of phi^2 dh at a place, in voxels, to the rows of `moment`; see `_facet_moments`."""
+def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: float, fraction: float) -> None:
+    """Add a fraction of phi h and of phi^2 dh at a place, in voxels, to the rows of `moment`; see `_facet_moments`."""
     most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
     i = min(max(int(np.rint(at[0] + aside[0])), 0), most_i)
     j = min(max(int(np.rint(at[1] + aside[1])), 0), most_j)
@@ -221,27 +221,27 @@ def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: 
         d = 0 if channel == 0 else 1 + channel
         beyond = prefix[i, j, k + 1, d] - prefix[i, j, k, d]
         before = prefix[p, q, r + 1, d] - prefix[p, q, r, d]
-        moment[0, channel] += share * phi * 0.5 * (beyond + before)
-        moment[1, channel] += share * phi * phi * (beyond - before)
+        moment[0, channel] += fraction * phi * 0.5 * (beyond + before)
+        moment[1, channel] += fraction * phi * phi * (beyond - before)
 
 
 @unit
-def _add_image_gradient(g: Floats1, H: Floats2, state: State, rings: NodeRings, node: int) -> None:
+def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, node: int) -> None:
     """Add the derivative of the weighted E_D by a node's position to g (3,), and its curvature to H (3, 3), per voxel.
 
     As a facet moves by phi along its normal, the jump of (h - hbar)^2 over it changes as h does there. Like in a
     Gauss-Newton step that is all of the curvature that is taken, and only where it is positive.
     """
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
-    n, first, scale = cells.shape[1], rings.start[node], 2.0**-objective.bits
+    n, first, scale = cells.shape[1], stars.start[node], 2.0**-objective.bits
     moment = np.empty((2, objective.n_channels))
-    for r in range(first, rings.start[node + 1]):
-        cell = rings.cells[r]
+    for r in range(first, stars.start[node + 1]):
+        cell = stars.cells[r]
         for k in range(n):
-            twin = rings.twin[r, k]
-            if k == rings.corner[r] or twin < 0 or twin // n < r - first:
+            twin = stars.twin[r, k]
+            if k == stars.corner[r] or twin < 0 or twin // n < r - first:
                 continue  # not a facet of the node; on the boundary, along which the node slides; or done
-            other = rings.cells[first + twin // n]
+            other = stars.cells[first + twin // n]
             label_1, label_2 = state.complex.labels[cell], state.complex.labels[other]
             if _has_same_values(sums, cell, other, label_1, label_2, objective):
                 continue
@@ -264,7 +264,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, rings: NodeRings, 
                 value_2 = cell_value(sums, other, label_2, channel, objective)
                 jump += (value_2 - value_1) * (2.0 * moment[0, channel] - (value_1 + value_2) * weight)
                 rise += (value_2 - value_1) * moment[1, channel]
-            bend = BEND_SHARE * max(rise, 0.0) / (FACET_ASIDE * area)
+            bend = BEND_FRACTION * max(rise, 0.0) / (FACET_ASIDE * area)
             for d in range(3):
                 g[d] += objective.image * jump * normal[d]
                 for m in range(3):
@@ -285,14 +285,14 @@ def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2
 
 
 @unit
-def _add_tension_gradient(g: Floats1, state: State, rings: NodeRings, node: int) -> None:
+def _add_tension_gradient(g: Floats1, state: State, stars: NodeStars, node: int) -> None:
     """Add the derivative of what the interfaces around a node cost to g (3,), per mm."""
     mesh, objective = state.complex, state.objective
-    for r in range(rings.start[node], rings.start[node + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        cell = stars.cells[r]
         for k in range(mesh.cells.shape[1]):
             other = mesh.across[cell, k]
-            if k == rings.corner[r] or other < cell or not is_interface(mesh, cell, k):
+            if k == stars.corner[r] or other < cell or not is_interface(mesh, cell, k):
                 continue
             weight = pair_tension(objective, mesh.labels[cell], mesh.labels[other])
             a, b, c = outward(mesh.cells, cell, k)
@@ -312,16 +312,16 @@ def _add_tension_gradient(g: Floats1, state: State, rings: NodeRings, node: int)
 
 
 @unit
-def ring_tension(state: State, rings: NodeRings, node: int) -> float:
+def star_tension(state: State, stars: NodeStars, node: int) -> float:
     """What the interfaces around a node cost as the ticks stand."""
     mesh, total = state.complex, 0.0
     if not (state.objective.tension > 0.0 and mesh.meeting[node, 1] >= 0):
         return 0.0
-    for r in range(rings.start[node], rings.start[node + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        cell = stars.cells[r]
         for k in range(mesh.cells.shape[1]):
             other = mesh.across[cell, k]
-            if k != rings.corner[r] and other > cell and is_interface(mesh, cell, k):
+            if k != stars.corner[r] and other > cell and is_interface(mesh, cell, k):
                 a, b, c = outward(mesh.cells, cell, k)
                 weight = pair_tension(state.objective, mesh.labels[cell], mesh.labels[other])
                 total += weight * facet_area(mesh.ticks, a, b, c, state.objective)
@@ -330,21 +330,21 @@ def ring_tension(state: State, rings: NodeRings, node: int) -> float:
 
 @unit
 def _add_shape_gradient(
-    g: Floats1, H: Floats2, x: Floats2, state: State, rings: NodeRings, node: int
+    g: Floats1, H: Floats2, x: Floats2, state: State, stars: NodeStars, node: int
 ) -> tuple[float, float]:
     """Add the weighted shape energy's derivatives to g (3,), per mm, and H (3, 3), per mm^2.
 
-    Returns the distance in mm to the nearest centroid of the ring's cells, and the ring's worst cosine, up to the
-    floor.
+    Returns the distance in mm to the nearest centroid of the star's cells, and the star's worst cosine, up to the angle
+    limit.
     """
     cells, objective = state.complex.cells, state.objective
     n, power = cells.shape[1], objective.power
-    dim, nearest, least = n - 1, np.inf, objective.floor
+    dim, nearest, least = n - 1, np.inf, objective.angle_limit
     # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n. The volume is
     # linear in the corner's place, and S has the second derivative 2 n along each axis.
     alpha = -2.0 * power / dim if objective.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
-    for r in range(rings.start[node], rings.start[node + 1]):
-        cell, at = rings.cells[r], rings.corner[r]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        cell, at = stars.cells[r], stars.corner[r]
         load_cell(x, state.complex.ticks, cells, cell, objective)
         volume, S = _volume_and_squares(x, n)
         W = objective.geometry * state.complex.E_shape[cell]
@@ -360,7 +360,7 @@ def _add_shape_gradient(
             for m in range(3):
                 H[d, m] += W * (slope * (alpha * v[m] + power * w[m]) - alpha * v[d] * v[m] - power * w[d] * w[m])
         if n == 4 and least > -1.0:
-            least = min(least, cosine_up_to_floor(x, objective))
+            least = min(least, cosine_up_to_limit(x, objective))
     return np.sqrt(nearest) / n, least
 
 
@@ -380,19 +380,19 @@ class Gradients(NamedTuple):
     shape: Floats2  # (N, 3)
     image: Floats2  # (N, 3)
     state: State
-    rings: NodeRings
+    stars: NodeStars
 
 
 @unit
 def _gradients(work: Gradients, node: int) -> None:
     g, H = np.zeros(3), np.zeros((3, 3))
-    _add_shape_gradient(work.shape[node], H, np.empty((4, 3)), work.state, work.rings, node)
-    _add_image_gradient(g, H, work.state, work.rings, node)
+    _add_shape_gradient(work.shape[node], H, np.empty((4, 3)), work.state, work.stars, node)
+    _add_image_gradient(g, H, work.state, work.stars, node)
     put_row(work.image, node, _per_mm(g, work.state))
 
 
 class Trial(NamedTuple):
-    """What `ring_energy` measures of a node's ring of R cells."""
+    """What `star_energy` measures of a node's star of R cells."""
 
     x: Floats2  # (4, 3) room for a cell's corners
     shapes: Floats1  # (R,) shape energy of each cell; -1 if it is gone
@@ -403,49 +403,49 @@ TrialByValue = Annotated[Trial, by_value(Trial)]  # it is made by the kernels, s
 
 
 @helper
-def trial_of(state: State, rings: NodeRings, node: int) -> Trial:
-    """Room for what is measured of a node's ring."""
-    size, fluxes = rings.start[node + 1] - rings.start[node], state.complex.fluxes
+def trial_of(state: State, stars: NodeStars, node: int) -> Trial:
+    """Room for what is measured of a node's star."""
+    size, fluxes = stars.start[node + 1] - stars.start[node], state.complex.fluxes
     return Trial(np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2])))
 
 
 @inlined
-def ring_misfit(state: State, rings: NodeRings, node: int) -> tuple:
-    """The ring's weighted misfit to the mask before a move, times -1, and whether a move may change it."""
+def star_misfit(state: State, stars: NodeStars, node: int) -> tuple:
+    """The star's weighted misfit to the mask before a move, times -1, and whether a move may change it."""
     misfit, has_misfit = 0.0, False
     if state.objective.surface > 0.0:
-        for r in range(rings.start[node], rings.start[node + 1]):
-            misfit -= wrong_side(state.complex.sums, rings.cells[r], state.objective)
+        for r in range(stars.start[node], stars.start[node + 1]):
+            misfit -= wrong_side(state.complex.sums, stars.cells[r], state.objective)
             for k in range(state.complex.cells.shape[1]):
-                has_misfit = has_misfit or (k != rings.corner[r] and rings.twin[r, k] < 0)
+                has_misfit = has_misfit or (k != stars.corner[r] and stars.twin[r, k] < 0)
     return misfit, has_misfit
 
 
 @inlined
-def ring_shape(
-    trial: Trial, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
+def star_shape(
+    trial: Trial, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
 ) -> float:
-    """Weighted shape energy of a node's ring as the ticks stand; each cell's goes to `trial.shapes`.
+    """Weighted shape energy of a node's star as the ticks stand; each cell's goes to `trial.shapes`.
 
     Infinite if a cell is flat or inverted or has a cosine under `least`, or once the energy is above `limit`. Cells
     that have the node `joined`, at whose place the node is, count as gone.
     """
     cells, objective = state.complex.cells, state.objective
-    has_floor = cells.shape[1] == 4 and least > -1.0
-    first, energy = rings.start[node], 0.0
-    for r in range(first, rings.start[node + 1]):
-        if joined >= 0 and has_node(cells, rings.cells[r], joined):
+    has_limit = cells.shape[1] == 4 and least > -1.0
+    first, energy = stars.start[node], 0.0
+    for r in range(first, stars.start[node + 1]):
+        if joined >= 0 and has_node(cells, stars.cells[r], joined):
             trial.shapes[r - first] = -1.0
             continue
-        if has_floor:  # of tetrahedra; one determinant serves both questions
-            load_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
+        if has_limit:  # of tetrahedra; one determinant serves both questions
+            load_cell(trial.x, state.complex.ticks, cells, stars.cells[r], objective)
             determinant, S = determinant_and_squares(trial.x)
             shape = tet_energy(determinant, S, objective.power, objective.is_graded)
             is_safe = shape < np.inf and S * S * S <= objective.safe * determinant * determinant
             if not (is_safe or (shape < np.inf and worst_cosine(trial.x) >= least)):
                 return np.inf
         else:
-            shape = shape_of_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
+            shape = shape_of_cell(trial.x, state.complex.ticks, cells, stars.cells[r], objective)
         trial.shapes[r - first] = shape
         energy += objective.geometry * shape
         if energy > limit:
@@ -454,28 +454,28 @@ def ring_shape(
 
 
 @inlined
-def ring_image(
-    sums: NDArray, trial: Trial, energy: float, misfit: float, bound: float, node: int, state: State, rings: NodeRings
+def star_image(
+    sums: NDArray, trial: Trial, energy: float, misfit: float, bound: float, node: int, state: State, stars: NodeStars
 ) -> tuple:
-    """Add the image's energy in a node's ring as the ticks stand to `energy`, and what it has of the misfit to that.
+    """Add the image's energy in a node's star as the ticks stand to `energy`, and what it has of the misfit to that.
 
     Infinite once the energy is above `bound`. Fluxes go to `trial`, in whose `shapes` cells that are gone are
     negative; `sums` (1, D) is room for those of a cell.
     """
     cells, objective, shapes, fluxes = state.complex.cells, state.objective, trial.shapes, trial.fluxes
-    n, D, first = cells.shape[1], fluxes.shape[2], rings.start[node]
-    for r in range(first, rings.start[node + 1]):
+    n, D, first = cells.shape[1], fluxes.shape[2], stars.start[node]
+    for r in range(first, stars.start[node + 1]):
         if shapes[r - first] < 0.0:
             continue
-        cell = rings.cells[r]
+        cell = stars.cells[r]
         for d in range(D):
             sums[0, d] = 0.0
         for k in range(n):
-            if k == rings.corner[r]:
+            if k == stars.corner[r]:
                 for d in range(D):
                     sums[0, d] += state.complex.fluxes[cell, k, d]
                 continue
-            twin = rings.twin[r, k]
+            twin = stars.twin[r, k]
             if not (0 <= twin and twin // n < r - first and shapes[twin // n] >= 0.0):
                 a, b, c = outward(cells, cell, k)
                 put_flux(fluxes, r - first, k, state.complex.ticks, a, b, c, objective)
@@ -492,36 +492,36 @@ def ring_image(
 
 
 @unit
-def ring_energy(
-    trial: TrialByValue, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
+def star_energy(
+    trial: TrialByValue, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
 ) -> float:
-    """Energy of a node's ring as the ticks stand, all that was measured in `trial`; infinite as `ring_shape`.
+    """Energy of a node's star as the ticks stand, all that was measured in `trial`; infinite as `star_shape`.
 
-    What the ring's misfit to the mask is more than it was is added.
+    What the star's misfit to the mask is more than it was is added.
     """
-    misfit, has_misfit = ring_misfit(state, rings, node)
+    misfit, has_misfit = star_misfit(state, stars, node)
     bound = np.inf if has_misfit else limit  # no sum says anything before all of the misfit is in it
-    energy = ring_shape(trial, bound, least, node, state, rings, joined)  # cheap refusals before any voxel is read
+    energy = star_shape(trial, bound, least, node, state, stars, joined)  # cheap refusals before any voxel is read
     if energy == np.inf or state.objective.image == 0.0:
         return energy
     sums = np.empty((1, trial.fluxes.shape[2]))
-    energy += ring_tension(state, rings, node)
-    energy, misfit = ring_image(sums, trial, energy, misfit, bound, node, state, rings)
+    energy += star_tension(state, stars, node)
+    energy, misfit = star_image(sums, trial, energy, misfit, bound, node, state, stars)
     if has_misfit:
         energy += misfit
     return energy if energy <= limit else np.inf
 
 
 @unit
-def store(trial: TrialByValue, node: int, state: State, rings: NodeRings) -> None:
-    """Write what `ring_energy` measured of a node's ring into the complex."""
-    first, fluxes = rings.start[node], state.complex.fluxes
-    for r in range(first, rings.start[node + 1]):
-        cell = rings.cells[r]
+def store(trial: TrialByValue, node: int, state: State, stars: NodeStars) -> None:
+    """Write what `star_energy` measured of a node's star into the complex."""
+    first, fluxes = stars.start[node], state.complex.fluxes
+    for r in range(first, stars.start[node + 1]):
+        cell = stars.cells[r]
         state.complex.E_shape[cell] = trial.shapes[r - first]
         if state.objective.image > 0.0:
             for k in range(fluxes.shape[1]):
-                if k != rings.corner[r]:
+                if k != stars.corner[r]:
                     for d in range(fluxes.shape[2]):
                         fluxes[cell, k, d] = trial.fluxes[r - first, k, d]
             sum_up(state.complex.sums, fluxes, cell)
@@ -531,7 +531,7 @@ class Sweep(NamedTuple):
     """The groups of one colour, whose nodes are to be moved."""
 
     state: State
-    rings: NodeRings
+    stars: NodeStars
     groups: Blocks
     chosen: Ints1  # (G,) the groups
     may_move: Bools1  # (N,)
@@ -543,7 +543,7 @@ def _sweep(work: Sweep, number: int) -> None:
     groups, block = work.groups, work.chosen[number]
     for at in range(groups.start[block], groups.start[block + 1]):
         if work.may_move[groups.nodes[at]]:
-            work.gains[groups.nodes[at]] = _move(groups.nodes[at], work.state, work.rings)
+            work.gains[groups.nodes[at]] = _move(groups.nodes[at], work.state, work.stars)
 
 
 class Search(NamedTuple):
@@ -552,52 +552,52 @@ class Search(NamedTuple):
     x: NDArray[np.float64]  # (4, 3) room for a cell's corners
     normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.surface.normals_at`
     is_sliding: bool  # whether the node stays on its surfaces
-    best: NDArray[np.float64]  # (1,) the least energy of the ring
+    best: NDArray[np.float64]  # (1,) the least energy of the star
     place: NDArray[np.int64]  # (1, 3) where that is, ticks
     slot: NDArray[np.int64]  # (1,)
     shapes: NDArray[np.float64]  # (2, R) as of `Trial`
     fluxes: NDArray[np.float64]  # (2, R, n+1, D)
 
 
-# Its steps, and those of `ring_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
+# Its steps, and those of `star_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
 # inlined steps 3 to 8 % (MNI152 T1, 5,000 nodes, one thread).
 @unit
-def _move(node: int, state: State, rings: NodeRings) -> float:
-    """Move one node towards the least energy of its ring, if that lowers it; returns by how much."""
+def _move(node: int, state: State, stars: NodeStars) -> float:
+    """Move one node towards the least energy of its star, if that lowers it; returns by how much."""
     ticks, fluxes, has_image = state.complex.ticks, state.complex.fluxes, state.objective.image > 0.0
     x, normal, g, H = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3), np.zeros((3, 3))
-    # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
-    nearest, least = _add_shape_gradient(g, H, x, state, rings, node)
+    # A star with flat cells may stay as it is, but not get worse: hence the star's own `least`.
+    nearest, least = _add_shape_gradient(g, H, x, state, stars, node)
     if has_image and state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
-        _add_tension_gradient(g, state, rings, node)
+        _add_tension_gradient(g, state, stars, node)
     _turn_to_index(g, H, state.objective.matrix)
     if has_image:
-        _add_image_gradient(g, H, state, rings, node)
+        _add_image_gradient(g, H, state, stars, node)
     is_sliding = slides(normal, state, node)
     step = _sliding_step(normal, g, node, state) if is_sliding else _newton_step(g, H, node, state)
     moved, slope = times(state.objective.matrix, step), g[0] * step[0] + g[1] * step[1] + g[2] * step[2]
     square = dot(moved, moved)  # mm^2
     if not (square > 0.0 and slope < 0.0):
         return 0.0
-    energy, size = ring_tension(state, rings, node), rings.start[node + 1] - rings.start[node]
-    for r in range(rings.start[node], rings.start[node + 1]):
-        energy += cell_energy(state, rings.cells[r])
+    energy, size = star_tension(state, stars, node), stars.start[node + 1] - stars.start[node]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        energy += cell_energy(state, stars.cells[r])
     search = Search(
         x, normal, is_sliding, np.empty(1), np.empty((1, 3), dtype=np.int64), np.zeros(1, dtype=np.int64),
         np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2]))
     )  # fmt: skip
     search.best[0] = energy
     put_row(search.place, 0, row(ticks, node))
-    length, bend = FIRST_STEP_SHARE * nearest / np.sqrt(square), dot(step, times(H, step))
+    length, bend = FIRST_STEP_FRACTION * nearest / np.sqrt(square), dot(step, times(H, step))
     if bend > 0.0:
         length = min(length, -slope / bend)
-    _search_line(search, step, length, slope, least, node, state, rings)
+    _search_line(search, step, length, slope, least, node, state, stars)
     if not search.best[0] < energy and has_image:
-        _search_axes(search, step, AXIS_STEP_SHARE * nearest, least, node, state, rings)
+        _search_axes(search, step, AXIS_STEP_FRACTION * nearest, least, node, state, stars)
     put_row(ticks, node, row(search.place, 0))
     if search.best[0] < energy:
         slot = search.slot[0]
-        store(Trial(x, search.shapes[slot], search.fluxes[slot]), node, state, rings)
+        store(Trial(x, search.shapes[slot], search.fluxes[slot]), node, state, stars)
     return energy - search.best[0]
 
 
@@ -661,14 +661,14 @@ def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple
 
 @inlined
 def _try_place(
-    search: Search, place: tuple, limit: float, least: float, node: int, state: State, rings: NodeRings
+    search: Search, place: tuple, limit: float, least: float, node: int, state: State, stars: NodeStars
 ) -> float:
-    """Energy of the ring with the node at a place, ticks, or on the surface beside it; the best is kept in mind."""
+    """Energy of the star with the node at a place, ticks, or on the surface beside it; the best is kept in mind."""
     put_row(state.complex.ticks, node, place)
-    if search.is_sliding and not slid(search.normal, state, rings, node):
+    if search.is_sliding and not slid(search.normal, state, stars, node):
         return np.inf
     slot = 1 - search.slot[0]
-    value = ring_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, rings, -1)
+    value = star_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, stars, -1)
     if value < search.best[0]:
         search.best[0], search.slot[0] = value, slot
         put_row(search.place, 0, row(state.complex.ticks, node))
@@ -677,7 +677,7 @@ def _try_place(
 
 @inlined
 def _search_line(
-    search: Search, step: tuple, t: float, slope: float, least: float, node: int, state: State, rings: NodeRings
+    search: Search, step: tuple, t: float, slope: float, least: float, node: int, state: State, stars: NodeStars
 ) -> None:
     """Look t steps ahead, then where the parabola through what was measured has its vertex.
 
@@ -692,7 +692,7 @@ def _search_line(
             here[2] + np.int64(np.rint(t * step[2] / scale)),
         )
         limit = np.inf if trial == 0 else search.best[0]
-        value = _try_place(search, place, limit, least, node, state, rings)
+        value = _try_place(search, place, limit, least, node, state, stars)
         is_lower = search.best[0] < energy
         if trial > 0 and is_lower:
             return
@@ -713,7 +713,7 @@ def _search_line(
 
 @inlined
 def _search_axes(
-    search: Search, step: tuple, length: float, least: float, node: int, state: State, rings: NodeRings
+    search: Search, step: tuple, length: float, least: float, node: int, state: State, stars: NodeStars
 ) -> None:
     """Look a length, mm, along each free axis in turn, where the step goes first, and go on from where E is lower.
 
@@ -734,30 +734,30 @@ def _search_axes(
                 here[1] + (shift if axis == 1 else 0),
                 here[2] + (shift if axis == 2 else 0),
             )
-            if _try_place(search, place, search.best[0], least, node, state, rings) < energy:
+            if _try_place(search, place, search.best[0], least, node, state, stars) < energy:
                 break
             shift = -shift
 
 
 @unit
-def slid(normal: Floats2, state: State, rings: NodeRings, node: int) -> bool:
+def slid(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
     """Bring a moved node back to its surfaces; whether it got there, and the mask's facets face as they should."""
     is_there = put_on_surface(normal, state, node)
-    return is_there and (not state.complex.is_frozen[node, 3] or ring_faces_up(normal, state, rings, node, -1))
+    return is_there and (not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1))
 
 
 # Nodes between labels are brought to the surface that they are to slide on.
 
 
-def attract(state: State, rings: NodeRings, groups: Blocks, floor: float) -> None:
-    """Move nodes between labels to where those meet, or as far as no cell is left flatter than `floor`, degrees.
+def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) -> None:
+    """Move nodes between labels to where those meet, or as far as no cell is left flatter than `angle_limit`.
 
-    A cell that is flatter already may get no worse. E may rise. `floor` is minus a cosine, as of an `Objective`.
+    A cell that is flatter already may get no worse. E may rise. `angle_limit` is minus a cosine, as of an `Objective`.
     """
-    lowered = state._replace(objective=state.objective._replace(floor=floor))
+    lowered = state._replace(objective=state.objective._replace(angle_limit=angle_limit))
     is_between = state.complex.meeting[:, 1] >= 0
-    laid_out = packed(lowered), packed(rings), packed(groups)
-    for chosen in colours_of(state, rings, groups):
+    laid_out = packed(lowered), packed(stars), packed(groups)
+    for chosen in colours_of(state, stars, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
             run(_attract, len(chosen), Sweep(*laid_out, chosen, is_between, np.zeros(0)))
 
@@ -767,33 +767,33 @@ def _attract(work: Sweep, number: int) -> None:
     groups, block = work.groups, work.chosen[number]
     for at in range(groups.start[block], groups.start[block + 1]):
         if work.may_move[groups.nodes[at]]:
-            _approach(groups.nodes[at], work.state, work.rings)
+            _approach(groups.nodes[at], work.state, work.stars)
 
 
 @unit
-def _approach(node: int, state: State, rings: NodeRings) -> None:
+def _approach(node: int, state: State, stars: NodeStars) -> None:
     ticks, normal, x = state.complex.ticks, np.zeros((7, 3)), np.empty((4, 3))
     if is_on_surface(normal, state, node):
         return
-    least = state.objective.floor
-    for r in range(rings.start[node], rings.start[node + 1]):
-        load_cell(x, ticks, state.complex.cells, rings.cells[r], state.objective)
+    least = state.objective.angle_limit
+    for r in range(stars.start[node], stars.start[node + 1]):
+        load_cell(x, ticks, state.complex.cells, stars.cells[r], state.objective)
         if state.complex.cells.shape[1] == 4:
-            least = min(least, cosine_up_to_floor(x, state.objective))
+            least = min(least, cosine_up_to_limit(x, state.objective))
     here = row(ticks, node)
     put_on_surface(normal, state, node)
-    way, share, trial = minus(row(ticks, node), here), 1.0, trial_of(state, rings, node)
+    way, fraction, trial = minus(row(ticks, node), here), 1.0, trial_of(state, stars, node)
     for _ in range(APPROACH_TRIALS):
         put_row(
             ticks, node,
             (
-                here[0] + np.int64(np.rint(share * way[0])),
-                here[1] + np.int64(np.rint(share * way[1])),
-                here[2] + np.int64(np.rint(share * way[2])),
+                here[0] + np.int64(np.rint(fraction * way[0])),
+                here[1] + np.int64(np.rint(fraction * way[1])),
+                here[2] + np.int64(np.rint(fraction * way[2])),
             ),
         )  # fmt: skip
-        if ring_energy(trial, np.inf, least, node, state, rings, -1) < np.inf:
-            store(trial, node, state, rings)
+        if star_energy(trial, np.inf, least, node, state, stars, -1) < np.inf:
+            store(trial, node, state, stars)
             return
-        share *= 0.5
+        fraction *= 0.5
     put_row(ticks, node, here)

@@ -20,7 +20,7 @@ def state_of(
     content: Content, mesh: Mesh, grid: SamplingGrid, k_D: float, power: float = SHAPE_POWER,
     boundary: Boundary = "slide", is_graded: bool = False, whole: Whole | None = None,
 ) -> State:  # fmt: skip
-    """The state of an initial mesh, which normalises the two energies; no floor yet. `grid` is the content's.
+    """The state of an initial mesh, which normalises the two energies; no angle limit yet. `grid` is the content's.
 
     A part of a mesh is normalised by the `whole`; what it shares with the rest stays as it is, node for node and facet
     for facet, as boundary nodes beside the box's sides do.
@@ -125,7 +125,7 @@ def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
-    """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without a floor."""
+    """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without an angle limit."""
     return Objective(
         volume=volume_of(grid),
         bits=int(grid.bits),
@@ -137,7 +137,7 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
         n_channels=int(grid.n_channels),
         power=float(power),
         is_graded=bool(is_graded),
-        floor=-1.0,
+        angle_limit=-1.0,
         safe=np.inf,
         rounding=0.0,
         wrong_side=0.0,
@@ -148,14 +148,14 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
     )
 
 
-def with_floor(state: State, degrees: float) -> State:
+def with_min_dihedral(state: State, degrees: float) -> State:
     """The state in which no move may leave a dihedral angle under `degrees`, nor one that is under it any smaller."""
-    floor, safe = floor_of(degrees)
-    return state._replace(objective=state.objective._replace(floor=floor, safe=safe))
+    angle_limit, safe = angle_limit_of(degrees)
+    return state._replace(objective=state.objective._replace(angle_limit=angle_limit, safe=safe))
 
 
-def floor_of(degrees: float) -> tuple[float, float]:
-    """`floor` and `safe` of an `Objective`, for a smallest dihedral angle; 0 for none.
+def angle_limit_of(degrees: float) -> tuple[float, float]:
+    """`angle_limit` and `safe` of an `Objective`, for a minimum dihedral angle; 0 for none.
 
     Of all tetrahedra with a dihedral angle t up to a regular one's, eta is least for the one that is symmetric about
     that edge and the opposite one: eta^3 = ((1 + s^2) / (s c))^2 / 8 with s, c = sin, cos(t / 2), and it falls as t

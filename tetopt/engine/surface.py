@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import ON_SURFACE_VOXELS
-from tetopt.engine.complex import NodeRings, State, has_node, outward, place
+from tetopt.engine.complex import NodeStars, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
 
@@ -17,7 +17,7 @@ NEWTON_STEPS = 6  # onto the surface, at most
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
 ASIDE_VOXELS = 0.25  # on either side of a place: where the level is taken for its slope
 MOST_MEETING = 4  # labels whose levels a node is brought to; where more meet, four of them
-PARALLEL_SHARE = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
+PARALLEL_FRACTION = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
 FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
 
 
@@ -81,16 +81,16 @@ def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: Floats
 
 
 @unit
-def ring_faces_up(uphill: Floats2, state: State, rings: NodeRings, node: int, joined: int) -> bool:
+def star_faces_up(uphill: Floats2, state: State, stars: NodeStars, node: int, joined: int) -> bool:
     """`faces_up` for all facets of the boundary around a node where it is, of cells that do not have `joined`."""
     cells = state.complex.cells
     uphill_at(uphill, state, node)
-    for r in range(rings.start[node], rings.start[node + 1]):
-        cell = rings.cells[r]
+    for r in range(stars.start[node], stars.start[node + 1]):
+        cell = stars.cells[r]
         if joined >= 0 and has_node(cells, cell, joined):
             continue
         for k in range(cells.shape[1]):
-            is_outer = state.complex.across[cell, k] < 0 and k != rings.corner[r]
+            is_outer = state.complex.across[cell, k] < 0 and k != stars.corner[r]
             if is_outer and not faces_up(state, cell, k, node, node, uphill):
                 return False
     return True
@@ -180,7 +180,7 @@ def combined_ways(
     v = row(normal, 4)
     g01, g11 = dot(row(normal, 0), v), dot(row(normal, 1), v)
     pair = g00 * g11 - g01 * g01
-    if not (g11 > FLAT_RISE and pair > PARALLEL_SHARE * g00 * g11):
+    if not (g11 > FLAT_RISE and pair > PARALLEL_FRACTION * g00 * g11):
         return False, w
     if count == 2:
         m0, m1 = (g11 * r[0] - g01 * r[1]) / pair, (g00 * r[1] - g01 * r[0]) / pair
@@ -189,7 +189,7 @@ def combined_ways(
     g02, g12, g22 = dot(row(normal, 0), u), dot(row(normal, 1), u), dot(row(normal, 2), u)
     c0, c1 = g01 * g12 - g02 * g11, g01 * g02 - g00 * g12
     triple = g02 * c0 + g12 * c1 + g22 * pair
-    if not (g22 > FLAT_RISE and triple > PARALLEL_SHARE * pair * g22):
+    if not (g22 > FLAT_RISE and triple > PARALLEL_FRACTION * pair * g22):
         return False, w
     # Cramer's rule, from the adjugate of the symmetric matrix of the g's.
     a00, a01, a11 = g11 * g22 - g12 * g12, g02 * g12 - g01 * g22, g00 * g22 - g02 * g02

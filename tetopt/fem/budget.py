@@ -18,9 +18,9 @@ from tetopt.system.budget import available_bytes
 STEP_GROWTH = 1.02  # between voxel sizes that are tried for the reference's grid: it misses the limit by under 6 %
 TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take hardly more
 TIMED_DOFS = 3_000_000  # of the grid on which an iteration is timed: larger than the processor's caches
-SOLUTION_SHARE = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
+SOLUTION_RATIO = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
 LEAST_DOFS = 1_000  # however little time there is
-FREE_SHARE = 0.8  # of the memory that is free may be taken
+FREE_FRACTION = 0.8  # of the memory that is free may be taken
 
 
 class Budget(NamedTuple):
@@ -71,10 +71,10 @@ def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percen
     trial = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TRIAL_DOFS))
     iterations = sum(reference(trial, nu, percent).work.iterations for nu in nus)
     timed = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TIMED_DOFS))
-    in_time = seconds / (SOLUTION_SHARE * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
+    in_time = seconds / (SOLUTION_RATIO * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
     free = available_bytes()
     # The references stay, all of them, with two fields each.
-    in_memory = np.inf if free is None else FREE_SHARE * free / (DOF_BYTES + 16.0 * (len(nus) - 1))
+    in_memory = np.inf if free is None else FREE_FRACTION * free / (DOF_BYTES + 16.0 * (len(nus) - 1))
     return Budget(max(LEAST_DOFS, int(min(in_time, in_memory, whole))), bool(in_memory < min(in_time, whole)))
 
 

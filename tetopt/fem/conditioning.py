@@ -17,7 +17,15 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, cg, eigsh, lobpcg
 
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import RESIDUAL_SHARE, Method, System, factorized, is_direct, multigrid, on_one_blas_thread
+from tetopt.fem.elasticity import (
+    RESIDUAL_FRACTION,
+    Method,
+    System,
+    factorized,
+    is_direct,
+    multigrid,
+    on_one_blas_thread,
+)
 
 DENSE_DOFS = 32  # up to so many a full matrix is taken: the Lanczos solver wants more dofs than it finds eigenvalues
 
@@ -138,7 +146,7 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but where moduli differ a lot it comes through
 
 
-def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_SHARE) -> int:
+def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_FRACTION) -> int:
     """Steps that conjugate gradients with the diagonal as preconditioner take to solve K_ff x = load from x = 0.
 
     Parameters
@@ -170,5 +178,5 @@ def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESI
 
 
 def _start(K_ff: csr_array, n_vectors: int = 1) -> NDArray[np.float64]:
-    """Fixed start vectors, (F, n_vectors), with a share of every eigenvector."""
+    """Fixed start vectors, (F, n_vectors), with a part of every eigenvector."""
     return np.random.default_rng(0).standard_normal((K_ff.shape[0], n_vectors))

@@ -30,7 +30,7 @@ from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_arra
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from tetopt.check import check_unfolded, facets_on_box, filled_share
+from tetopt.check import check_unfolded, facets_on_box, filled_fraction
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
@@ -38,7 +38,7 @@ from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order, shape_sl
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.laws import checked_young
+from tetopt.model.mappings import checked_young
 from tetopt.system.budget import check_memory
 
 Method = Literal["auto", "direct", "amg"]
@@ -49,7 +49,7 @@ Result = TypeVar("Result")
 # 3 s and 57 k take 140 s and 4 GB, where multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
 DIRECT_DOFS = {2: 200_000, 3: 10_000}
 PAIR_BYTES = 160.0  # of memory for each pair of a cell's nodes: numbers, entries, as they are sorted, and the matrix
-RESIDUAL_SHARE = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
+RESIDUAL_FRACTION = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
 
 
 def on_one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -306,7 +306,7 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
             f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is of another image, or crop"
         )
-    filled = filled_share(mesh, image)
+    filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-5:
         raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box; they overlap or leave parts out")
 
@@ -532,10 +532,10 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
         if is_direct(system, method):
             solution = factorized(system.K_ff)(system.load)
         else:
-            options: dict[str, Any] = {"rtol": RESIDUAL_SHARE, "maxiter": 1000, "callback": count}
+            options: dict[str, Any] = {"rtol": RESIDUAL_FRACTION, "maxiter": 1000, "callback": count}
             solution, _ = cg(system.K_ff, system.load, M=multigrid(system), **options)
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
-        allowed = 10.0 * RESIDUAL_SHARE * float(np.linalg.norm(system.load))
+        allowed = 10.0 * RESIDUAL_FRACTION * float(np.linalg.norm(system.load))
         if not residual <= allowed:
             raise RuntimeError(f"elasticity: not solved, the residual is {residual:.3g} mN where {allowed:.3g} may be")
         dofs[system.free] = solution

@@ -190,7 +190,8 @@ def near_interface(labels: NDArray) -> NDArray[np.bool_]:
 
 
 def averaged(image: Image, shape: tuple[int, ...]) -> Image:
-    """The image on a coarser grid over the same box: each new voxel is the mean over it, cut voxels by their share.
+    """The image on a coarser grid over the same box: each new voxel is the mean over it, cut voxels by the part of
+    them.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
 
 
 def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
-    """InputError if a piece of the mesh, cells that hang together by nodes, has no prescribed dof."""
+    """InputError if a connected component of the mesh, cells linked by nodes, has no prescribed dof."""
     n_bodies = int(body.max()) + 1
     touches = coo_array(
         (np.ones(cells.size, dtype=np.int8), (cells.ravel(), np.repeat(body, cells.shape[1]) + len(is_prescribed))),
@@ -91,7 +91,7 @@ def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescrib
         piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
-            f"mesh: {n_pieces} pieces have no node that is held, pushed or on a spring, the first has {len(piece)} "
+            f"mesh: {n_pieces} components have no node that is held, pushed or on a spring, the first has {len(piece)} "
             f"cells around cell {piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
         )
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import (
-    RESIDUAL_SHARE,
+    RESIDUAL_FRACTION,
     Method,
     Outside,
     System,
@@ -253,12 +253,12 @@ def weight_forces(
     n = mesh.ndim
     points, cells = of_order(mesh.points, mesh.cells, order)
     if order == 1:
-        shares = np.full(n + 1, 1.0 / (n + 1))
+        fractions = np.full(n + 1, 1.0 / (n + 1))
     else:
         corner, edge = (0.0, 1.0 / 3.0) if n == 2 else (-1.0 / 20.0, 1.0 / 5.0)
-        shares = np.array([corner] * (n + 1) + [edge] * len(cell_edges(n)))
+        fractions = np.array([corner] * (n + 1) + [edge] * len(cell_edges(n)))
     mass = KG_PER_MM3 * density * volumes(mesh.points, mesh.cells)
-    at_node = np.bincount(cells.ravel(), weights=(mass[:, None] * shares).ravel(), minlength=len(points))
+    at_node = np.bincount(cells.ravel(), weights=(mass[:, None] * fractions).ravel(), minlength=len(points))
     return at_node[:, None] * acceleration
 
 
@@ -271,7 +271,7 @@ def _check_balance(
     """
     total = np.where(task.is_prescribed, reaction, 0.0) + task.outside.forces + pull
     left = float(np.abs(system.modes.T @ total.ravel()).max())
-    residual = 10.0 * RESIDUAL_SHARE * np.sqrt(len(system.free)) * float(np.linalg.norm(system.load))
+    residual = 10.0 * RESIDUAL_FRACTION * np.sqrt(len(system.free)) * float(np.linalg.norm(system.load))
     size = float(np.abs(system.modes).max())
     allowed = size * (residual + BALANCE_ROUNDING * float(system.K.diagonal() @ np.abs(u.ravel())))
     if not left <= allowed:

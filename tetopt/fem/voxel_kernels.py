@@ -77,10 +77,10 @@ def product(a: NDArray, b: NDArray) -> float:
         return float(_products(a, b).sum())
 
 
-def smooth(d: NDArray, x: NDArray, r: NDArray, share: NDArray, scale: NDArray, factors: tuple[float, float]) -> None:
-    """One Chebyshev step: d becomes f_0 d + f_1 share scale r, and is added to x; `share` (I, J, K), `scale` (n,)."""
-    with few_threads(share.size // VOXELS_PER_TASK):
-        _smooth(d, x, r, share, scale, np.array(factors, dtype=d.dtype))
+def smooth(d: NDArray, x: NDArray, r: NDArray, weight: NDArray, scale: NDArray, factors: tuple[float, float]) -> None:
+    """One Chebyshev step: d becomes f_0 d + f_1 weight scale r, and is added to x; `weight` (I, J, K), `scale` (n,)."""
+    with few_threads(weight.size // VOXELS_PER_TASK):
+        _smooth(d, x, r, weight, scale, np.array(factors, dtype=d.dtype))
 
 
 def restrict(coarse: NDArray, fine: NDArray, ways: tuple[Transfer, ...]) -> None:
@@ -259,18 +259,18 @@ def _scale_and_add(p: NDArray, z: NDArray, beta: float) -> None:
 
 
 @njit(cache=True, parallel=True)
-def _smooth(d: NDArray, x: NDArray, r: NDArray, share: NDArray, scale: NDArray, factors: NDArray) -> None:
+def _smooth(d: NDArray, x: NDArray, r: NDArray, weight: NDArray, scale: NDArray, factors: NDArray) -> None:
     for i in prange(d.shape[1]):
         for c in range(d.shape[0]):
             for j in range(d.shape[2]):
-                _smooth_row(d[c, i, j], r[c, i, j], share[i, j], factors[0], factors[1] * scale[c])
+                _smooth_row(d[c, i, j], r[c, i, j], weight[i, j], factors[0], factors[1] * scale[c])
                 _add_row(x[c, i, j], d[c, i, j])
 
 
 @njit(cache=True)
-def _smooth_row(d: NDArray, r: NDArray, share: NDArray, old: float, new: float) -> None:
+def _smooth_row(d: NDArray, r: NDArray, weight: NDArray, old: float, new: float) -> None:
     for k in range(len(d)):
-        d[k] = old * d[k] + new * share[k] * r[k]
+        d[k] = old * d[k] + new * weight[k] * r[k]
 
 
 @njit(cache=True)

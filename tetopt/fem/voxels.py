@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from tetopt.fem.elasticity import RESIDUAL_SHARE, lame_constants
+from tetopt.fem.elasticity import RESIDUAL_FRACTION, lame_constants
 from tetopt.fem.voxel_kernels import (
     Terms,
     Transfer,
@@ -81,7 +81,7 @@ class Level(NamedTuple):
 
     young: NDArray[np.float32]
     terms: Terms  # of -A, so that a product takes A d away from the residual
-    share: NDArray[np.float32]  # (I + 1, ...) 1 / sum of the moduli around each node, 0 on the plates
+    weight: NDArray[np.float32]  # (I + 1, ...) 1 / sum of the moduli around each node, 0 on the plates
     scale: NDArray[np.float32]  # (n,) 1 / (the element's diagonal times the largest eigenvalue)
     ways: tuple[Transfer, ...]  # to the next grid; none from the last
     r: NDArray[np.float32]  # residual
@@ -124,7 +124,7 @@ def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.fl
     n = len(jacobian)
     corners = np.array(list(combinations_of((0, 1), repeat=n)))
     lame_1, mu = (float(constant[0]) for constant in lame_constants(np.ones(1), nu, n))
-    size = abs(float(np.linalg.det(jacobian))) / 2**n  # of each Gauss point's share
+    size = abs(float(np.linalg.det(jacobian))) / 2**n  # of each Gauss point's part
     K = np.zeros((2**n, 2**n, n, n))
     for sign in combinations_of((-1.0, 1.0), repeat=n):
         at = 0.5 + np.array(sign) / np.sqrt(12.0)
@@ -151,7 +151,7 @@ def stiffness_product(grid: Grid, u: NDArray[np.float64]) -> NDArray[np.float64]
     return out
 
 
-def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_share: float = RESIDUAL_SHARE) -> Work:
+def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_fraction: float = RESIDUAL_FRACTION) -> Work:
     """Turn the displacements `u` between the plates into those without forces; those on the plates stay as they are.
 
     Parameters
@@ -160,7 +160,7 @@ def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_share: float = RES
         Moduli above 0.
     u : field of nodes
         mm, world, with the plates' displacements; what is between them is where the iteration begins. Overwritten.
-    residual_share : float
+    residual_fraction : float
         Residual over load that it goes down to; the load is what the plates alone do to the nodes next to them.
 
     Raises
@@ -180,7 +180,7 @@ def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_share: float = RES
     hierarchy = multigrid_of(grid)
     p, q = np.zeros_like(u), np.empty_like(u)
     size, old, iterations = _norm(r), 1.0, 0
-    while size > residual_share * load and iterations < ITERATION_LIMIT:
+    while size > residual_fraction * load and iterations < ITERATION_LIMIT:
         z = preconditioned(hierarchy, r, size)
         now = product(r, z)
         turn(p, z, now / old if iterations else 0.0)
@@ -193,9 +193,10 @@ def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_share: float = RES
     q[:] = 0.0
     add_product(q, u, grid.young, terms)
     residual = _norm(_free(q, plates))
-    if not residual <= 10.0 * residual_share * load:
+    if not residual <= 10.0 * residual_fraction * load:
         raise RuntimeError(
-            f"reference: not solved, the residual is {residual:.3g} mN where {10.0 * residual_share * load:.3g} may be"
+            f"reference: not solved, the residual is {residual:.3g} mN where {10.0 * residual_fraction * load:.3g} may "
+            f"be"
         )
     return Work(iterations, residual / load)
 
@@ -220,7 +221,7 @@ def multigrid_of(grid: Grid) -> Hierarchy:
     while True:
         level = _level(grid)
         shape = coarser(grid)
-        free = np.flatnonzero(np.broadcast_to(level.share > 0.0, level.x.shape))
+        free = np.flatnonzero(np.broadcast_to(level.weight > 0.0, level.x.shape))
         if len(free) <= DENSE_UNKNOWNS or shape == grid.young.shape:
             return Hierarchy([*levels, level], _inverse(level, free), free, grid.plates)
         levels.append(level._replace(ways=_ways(grid, shape)))
@@ -238,16 +239,16 @@ def coarser(grid: Grid) -> tuple[int, ...]:
 
 
 def block_means(data: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Means over the voxels of a coarser grid on the same box, cut voxels by their share."""
+    """Means over the voxels of a coarser grid on the same box, cut voxels by the part of them."""
     for axis, (new, old) in enumerate(zip(shape, data.shape, strict=True)):
         if new != old:
             rows = np.moveaxis(data, axis, 0)
-            means = _shares(new, old) @ rows.reshape(old, -1)
+            means = _fractions(new, old) @ rows.reshape(old, -1)
             data = np.moveaxis(means.reshape(new, *rows.shape[1:]), 0, axis)
     return np.ascontiguousarray(data)
 
 
-def _shares(new: int, old: int) -> csr_array:
+def _fractions(new: int, old: int) -> csr_array:
     """How much of each new voxel's length is of each old one, (new, old)."""
     ends = np.union1d(np.arange(new + 1) * old / new, np.arange(old + 1.0))
     middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
@@ -266,11 +267,11 @@ def _level(grid: Grid) -> Level:
     around = zeros[0].copy()
     for corner in combinations_of((0, 1), (0, 1) if n == 3 else (0,), (0, 1)):
         around[tuple(slice(c, c + s) for c, s in zip(corner, grid.young.shape, strict=True))] += grid.young
-    share = 1.0 / around
-    np.moveaxis(share, grid.plates, 0)[[0, -1]] = 0.0
+    weight = 1.0 / around
+    np.moveaxis(weight, grid.plates, 0)[[0, -1]] = 0.0
     single = np.float32
     return Level(
-        grid.young.astype(single), terms._replace(value=-terms.value.astype(single)), share.astype(single),
+        grid.young.astype(single), terms._replace(value=-terms.value.astype(single)), weight.astype(single),
         (1.0 / (diagonal * np.linalg.eigvalsh(matrix)[-1])).astype(single), (),
         *(zeros.astype(single) for _ in range(3)),
     )  # fmt: skip
@@ -302,7 +303,7 @@ def _cycle(hierarchy: Hierarchy, depth: int) -> None:
         return
     level.x[:], level.d[:] = 0.0, 0.0
     for k in range(SMOOTHING_STEPS):
-        smooth(level.d, level.x, level.r, level.share, level.scale, chebyshev_factors(k))
+        smooth(level.d, level.x, level.r, level.weight, level.scale, chebyshev_factors(k))
         add_product(level.r, level.d, level.young, level.terms)
     below = hierarchy.levels[depth + 1]
     restrict(below.r, _free(level.r, hierarchy.plates), level.ways)
@@ -310,7 +311,7 @@ def _cycle(hierarchy: Hierarchy, depth: int) -> None:
     prolong(level.d, level.x, below.x, level.ways)
     for k in range(SMOOTHING_STEPS):
         add_product(level.r, level.d, level.young, level.terms)
-        smooth(level.d, level.x, level.r, level.share, level.scale, chebyshev_factors(k))
+        smooth(level.d, level.x, level.r, level.weight, level.scale, chebyshev_factors(k))
 
 
 def chebyshev_factors(k: int) -> tuple[float, float]:

@@ -51,8 +51,8 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
     pairs = CUT_SECTIONS[pattern[cut]]  # (K, 4, 2)
     ends = np.take_along_axis(cells[cut][:, None, :], pairs, axis=2)
     low, high = height[ends[..., 0]], height[ends[..., 1]]
-    share = (low / (low - high))[..., None]
-    return Cut(points[ends[..., 0]] * (1.0 - share) + points[ends[..., 1]] * share, cut)
+    fraction = (low / (low - high))[..., None]
+    return Cut(points[ends[..., 0]] * (1.0 - fraction) + points[ends[..., 1]] * fraction, cut)
 
 
 def triangle_cut(
@@ -67,5 +67,5 @@ def triangle_cut(
     alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
     turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
     one, others = turned[:, :1], turned[:, 1:]
-    share = (height[one] / (height[one] - height[others]))[..., None]
-    return points[one] * (1.0 - share) + points[others] * share, np.flatnonzero(n_above % 3)
+    fraction = (height[one] / (height[one] - height[others]))[..., None]
+    return points[one] * (1.0 - fraction) + points[others] * fraction, np.flatnonzero(n_above % 3)

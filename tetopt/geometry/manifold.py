@@ -17,7 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
-from tetopt.geometry.topology import Facets, facets, rings
+from tetopt.geometry.topology import Facets, facets, stars
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -159,12 +159,12 @@ def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArra
         return is_kept
     sides = shared.cells[shared.of_cell]  # (M, n+1, 2)
     across = np.where(sides[..., 0] == np.arange(len(cells))[:, None], sides[..., 1], sides[..., 0])
-    around = rings(cells, int(cells.max()) + 1)
+    around = stars(cells, int(cells.max()) + 1)
     ridges, nodes = (deque(map(tuple, places.nodes.tolist())) for places in (at_ridges, at_nodes))
     while ridges or nodes:  # ridges first: at a node, those of the boundary are manifold
         place = ridges.popleft() if ridges else nodes.popleft()
-        ring = around.cells[around.start[place[0]] : around.start[place[0] + 1]].tolist()
-        corners = {cell: cells[cell].tolist() for cell in ring if is_kept[cell]}
+        near = around.cells[around.start[place[0]] : around.start[place[0] + 1]].tolist()
+        corners = {cell: cells[cell].tolist() for cell in near if is_kept[cell]}
         star = {cell: Corners(at, across[cell].tolist()) for cell, at in corners.items() if set(place) <= set(at)}
         for cell in _cells_at_pinch(place, star, size):
             is_kept[cell] = False

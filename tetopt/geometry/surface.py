@@ -23,11 +23,11 @@ from tetopt.geometry.topology import Facets, facets
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 # Copies are moved by this part of the smallest height of the cells around,
-SHIFT_SHARE = 2e-3
+SHIFT_FRACTION = 2e-3
 # or by so many float32 spacings, as binary STL is in float32,
 SHIFT_SPACINGS = 16
 # but never by more than this part of that height, so that no cell turns inside out.
-LARGEST_SHIFT_SHARE = 0.1
+LARGEST_SHIFT_FRACTION = 0.1
 
 # Steps of the search for a way that is inwards of a whole fan: with the mean of the normals instead, sheets of random
 # sets of cells cross fifteen times as often, with three steps about as seldom.
@@ -83,7 +83,7 @@ class _Sheets(NamedTuple):
 
     points: NDArray[np.float64]  # (S, 3), equal where `place` is
     place: NDArray[np.int64]  # (S,)
-    inside: NDArray[np.float64]  # (S,), the share of all directions that go into the solid, 0 to 1
+    inside: NDArray[np.float64]  # (S,), the fraction of all directions that go into the solid, 0 to 1
     height: NDArray[np.float64]  # (S,), mm, of the cells around
     normals: NDArray[np.float64]  # (C, 3), unit vectors, of the triangles of all sheets
     sheet: NDArray[np.int64]  # (C,), whose normal it is, ascending
@@ -307,8 +307,8 @@ def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float
     rank[order] = np.arange(len(order)) - np.repeat(first, count)
     last[order] = np.repeat(count - 1, count)
     spacing = np.spacing(np.abs(sheets.points).max(axis=1).astype(np.float32)).astype(np.float64)
-    farthest = np.maximum(SHIFT_SHARE * sheets.height, SHIFT_SPACINGS * last * spacing)
-    farthest = np.minimum(farthest, LARGEST_SHIFT_SHARE * sheets.height)
+    farthest = np.maximum(SHIFT_FRACTION * sheets.height, SHIFT_SPACINGS * last * spacing)
+    farthest = np.minimum(farthest, LARGEST_SHIFT_FRACTION * sheets.height)
     shift = farthest * rank / last
     sign = np.where(sheets.inside <= 0.5, -1.0, 1.0)
     return sheets.points + (sign * shift)[:, None] * _outwards(sheets.normals, sheets.sheet), shift

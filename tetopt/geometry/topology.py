@@ -1,4 +1,4 @@
-"""Who touches whom: facets, rings, colours and connected sets, from cells alone."""
+"""Who touches whom: facets, stars, colours and connected sets, from cells alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tetopt.geometry.simplex import facet_nodes
 from tetopt.system.kernel_cache import njit
 
 
-class Rings(NamedTuple):
+class Stars(NamedTuple):
     """The cells around each node, Omega_i, as compressed rows.
 
     The cells of node i are ``cells[start[i]:start[i + 1]]``, ascending.
@@ -32,12 +32,12 @@ class Facets(NamedTuple):
     sign: NDArray[np.int64]  # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
 
 
-def rings(cells: NDArray[np.integer], n_nodes: int) -> Rings:
-    """The 1-ring of cells around each of `n_nodes` nodes."""
+def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
+    """The star of each of `n_nodes` nodes: the cells around it."""
     order = np.argsort(cells.ravel(), kind="stable")
     counts = np.bincount(cells.ravel(), minlength=n_nodes)
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Rings(start, (order // cells.shape[1]).astype(np.int64))
+    return Stars(start, (order // cells.shape[1]).astype(np.int64))
 
 
 def facets(cells: NDArray[np.integer]) -> Facets:
@@ -109,11 +109,11 @@ def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) ->
 
 
 @njit(cache=True)
-def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
+def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArray:
     """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
 
-    `start` and `ring_cells` are the rows of `Rings`, cells int64 and contiguous. Greedy in node order, so the same mesh
-    always gets the same colours. Nodes of one colour can move at the same time: their rings have no cell in common.
+    `start` and `star_cells` are the rows of `Stars`, cells int64 and contiguous. Greedy in node order, so the same mesh
+    always gets the same colours. Nodes of one colour can move at the same time: their stars have no cell in common.
     """
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
@@ -121,7 +121,7 @@ def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArr
     for node in range(n_nodes):
         for r in range(start[node], start[node + 1]):
             for k in range(cells.shape[1]):
-                other = colours[cells[ring_cells[r], k]]
+                other = colours[cells[star_cells[r], k]]
                 if other >= 0:
                     taken_by[other] = node
         colour = 0

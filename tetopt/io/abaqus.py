@@ -86,7 +86,7 @@ def _check(model: Model) -> None:
         raise InputError("abaqus: expected a mesh of tetrahedra, got triangles; .vtu holds them")
     if model.loads and model.materials is None:
         raise InputError(
-            "abaqus: loads, but no materials to press on; give a law of the modulus (`young`) or leave out the loads"
+            "abaqus: loads, but no materials to press on; give a modulus mapping (`young`) or leave out the loads"
         )
     if count_of_steps(model.loads) > 1 and (some := [x for x in model.loads if x.kind == "spring" and x.step]):
         raise InputError(

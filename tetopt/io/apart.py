@@ -1,8 +1,8 @@
-"""A stranger's file read in a process of its own, by libraries of compiled code that end the process at damaged ones.
+"""An untrusted file read in a process of its own, by libraries of compiled code that end the process at damaged ones.
 
 The child is ``python -P -m tetopt.io.apart``: job by standard input, arrays by standard output, as a line of JSON and
 then their bytes, so that nothing of it is executed here (no pickle). Its memory is limited (RLIMIT_AS), so that what a
-header promises is refused instead of allocated, and so is its time. It costs a third of a second, most of it for
+header announces is refused instead of allocated, and so is its time. It costs a third of a second, most of it for
 loading the library, which the parent then need not load.
 """
 

@@ -120,7 +120,7 @@ def _check(model: Model) -> None:
     if model.mesh.ndim == 2:
         raise InputError("febio: expected a mesh of tetrahedra, got triangles; .vtu holds them")
     if model.materials is None:
-        raise InputError("febio: a part needs a material; give a law of the modulus (`young`)")
+        raise InputError("febio: a part needs a material; give a modulus mapping (`young`)")
     if taken := {YOUNG_MAP, NU_MAP, DENSITY_MAP, DEAD_FORCES} & model.cell_data.keys():
         raise InputError(f'febio: a map that the file needs is called "{min(taken)}"; call the cell data otherwise')
     check_one_step(model, "febio")

@@ -25,7 +25,7 @@ from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
-STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
+STRAIGHT_FRACTION = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
 
 
 def load_mesh(path: str | Path) -> MeshFile:
@@ -110,7 +110,7 @@ def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:
         notes.append(f"{n_torn} edges have a middle node in each of their cells: one of them is taken")
     start, end = np.moveaxis(raw.points[edges], 1, 0)
     off = np.linalg.norm(raw.points[nodes] - 0.5 * (start + end), axis=1)
-    straight = STRAIGHT_SHARE * np.linalg.norm(end - start, axis=1)
+    straight = STRAIGHT_FRACTION * np.linalg.norm(end - start, axis=1)
     if (raw.points.astype(np.float32) == raw.points).all():  # a file in single precision, which rounds midpoints
         straight += np.finfo(np.float32).eps * np.abs(raw.points).max()
     if n_curved := int((~(off <= straight)).sum()):

@@ -28,8 +28,8 @@ ITK_READERS = {
     ".mhd": "MetaImageIO",
     ".dcm": "GDCMImageIO",
 }
-# DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
-_UNEVEN_SHARE = 0.05
+# DICOM slices may be off an even spacing by this fraction of it, since positions are often rounded.
+_UNEVEN_FRACTION = 0.05
 _SAME_PLACE_MM = 1e-3  # slices nearer to each other are of one place
 # Below a folder without DICOM files, so many are looked into, by so many of their files, and so many are listed.
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
@@ -174,7 +174,7 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
         )
     step = (points[-1] - points[0]) / (n_slices - 1)
     off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
-    if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):
+    if off.max() > _UNEVEN_FRACTION * np.linalg.norm(step):
         raise InputError(
             f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the series again, or "
             "resample it to NIfTI"
@@ -186,7 +186,7 @@ def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
     """Where slices at `points`, (n, 3), mm, are not even: the step unlike the others, else the place `off` (n,)."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     usual = float(np.median(steps))
-    is_other = np.abs(steps - usual) > _UNEVEN_SHARE * usual
+    is_other = np.abs(steps - usual) > _UNEVEN_FRACTION * usual
     if not is_other.any():
         return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off the line through the first and last"
     k = int(np.abs(steps - usual).argmax())

@@ -138,7 +138,7 @@ def hdf_arrays(path: str) -> dict[str, Any]:
 
 
 class _Guarded:
-    """A stranger's HDF5 file, of which no more is opened than what lies in it, unpacked no further than it may."""
+    """An untrusted HDF5 file, of which no more is opened than what lies in it, unpacked no further than it may."""
 
     def __init__(self, file: h5py.File, size: int) -> None:
         self.root = file

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.promises import LABEL_VOXELS
+from tetopt.engine.requirements import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import violated, warning
 from tetopt.job.options import Method
@@ -24,20 +24,21 @@ ENERGY_RISE = 1e-3  # relative: E that ended higher above its least value than t
 LENGTH_ROUNDING = 1e-3  # relative: by which an edge may miss its limit before that is said
 TARGETS_MISSED = 0.1  # of the edges: so many far over their target are said
 FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are not shown
-EULER_SHARE = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
+EULER_FRACTION = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
 EULER_USUAL = 8  # an Euler number of less counts as this: single holes come and go with the cells' size
 EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for the image
 THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
 
 def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "mask") -> list[str]:
-    """The requirements that the mesh does not meet (`tetopt.engine.promises`), large labels without cells among them.
+    """The requirements that the mesh does not meet (`tetopt.engine.requirements`), large labels without cells among
+    them.
 
-    Each is told, and lesser misses are warned of. Messages call what is meshed `word`.
+    Each is told, and lesser deviations are warned of. Messages call what is meshed `word`.
     """
     lost = list(_lost(measured))
-    missed = [words for name, words in result.missed.items() if not (name == "labels" and lost)]
-    problems = [words.replace("the mask", f"the {word}") for words in (*missed, *lost)]
+    of_result = [words for name, words in result.violated.items() if not (name == "labels" and lost)]
+    problems = [words.replace("the mask", f"the {word}") for words in (*of_result, *lost)]
     for problem in problems:
         violated(problem)
     _warn_of_mask(measured.get("mask"), word)
@@ -74,7 +75,7 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
 def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if mask is None:
         return
-    if mask.components > mask.mesh_components:  # more of the mesh than of the mask is a requirement that is missed
+    if mask.components > mask.mesh_components:  # more of the mesh than of the mask is a requirement that is violated
         warning(
             f"the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: elements are too "
             f"large for the {word}'s detail here; allow more nodes"
@@ -85,7 +86,7 @@ def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
             f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than its details; "
             "allow more nodes"
         )
-    if abs(mask.mesh_euler - mask.euler) > EULER_SHARE * max(abs(mask.euler), EULER_USUAL):
+    if abs(mask.mesh_euler - mask.euler) > EULER_FRACTION * max(abs(mask.euler), EULER_USUAL):
         warning(
             f"the Euler number of the {word}'s surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
             f"the mesh has other holes and handles than the {word}; allow more nodes"

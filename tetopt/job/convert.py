@@ -59,7 +59,7 @@ def convert_file(
     solver : SolverOptions
     part : LabelledPart
     image : Path, optional
-        What means and laws are of, instead of what the mesh's file has.
+        What means and mappings are of, instead of what the mesh's file has.
     mask : Path, optional
         Only what lies in it counts.
     results : Path, optional

@@ -49,7 +49,7 @@ MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
 # Options that look at all cells or voxels at once, and the values of them that parts take besides none at all.
 PARTS_TAKE: dict[str, Any] = {
-    "mask": None, "background": None, "labels": None, "slice_": None, "target_error": None, "size_max": None,
+    "mask": None, "background": None, "labels": None, "slice_": None, "target_error": None, "edge_size": None,
     "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
 }  # fmt: skip
 LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # likewise, if the image is left in its file
@@ -67,7 +67,7 @@ def with_parts(plan: Plan) -> Plan:
     names = [field.name for field in dataclasses.fields(PartsOptions) if getattr(job, field.name) is not None]
     needed, free = _whole_bytes(plan), available_bytes()
     is_too_large = needed is not None and free is not None and needed > free
-    is_chosen = is_too_large and job.parts is None and _strange_option(plan) is None
+    is_chosen = is_too_large and job.parts is None and _unsupported_option(plan) is None
     if job.parts is None and not is_chosen:
         if names:
             note(f"`{names[0]}`: has no say, as the mesh is made in one piece; `parts` asks for parts")
@@ -77,8 +77,8 @@ def with_parts(plan: Plan) -> Plan:
             f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
             "in parts"
         )
-    elif (strange := _strange_option(plan)) is not None:
-        raise InputError(strange)
+    elif (unsupported := _unsupported_option(plan)) is not None:
+        raise InputError(unsupported)
     if job.worker_gb is not None and not job.worker_gb > 0.0:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
     if job.worker_gb is not None and (job.scheduler or job.cluster):
@@ -108,7 +108,7 @@ def _n_voxels(plan: Plan) -> int:
     return prod(cropped_shape(plan, (file_shape(plan.job.images[0]) or (0,))[:3]))
 
 
-def _strange_option(plan: Plan) -> str | None:
+def _unsupported_option(plan: Plan) -> str | None:
     """What a mesh in parts cannot be, in words; None if there is nothing."""
     job = plan.job
     if plan.mode != "graded":
@@ -139,8 +139,8 @@ def left_source(plan: Plan) -> Source | None:
     if plan.left is None:
         return None
     path = plan.left.path
-    if (strange := _whole_only(plan, LEFT_TAKE)) is not None:
-        raise InputError(strange)
+    if (unsupported := _whole_only(plan, LEFT_TAKE)) is not None:
+        raise InputError(unsupported)
     if plan.job.young is not None:
         note("`young`: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
     level = coarse_image(path, MOST_DRAWN) if plan.pictures and plan.job.crop is None else None

@@ -26,7 +26,7 @@ from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
 from tetopt.system.files import checked_output
 
-IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
+IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 UNNAMED_LISTED = 8  # of those that have no name: a line's worth
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
@@ -90,7 +90,7 @@ def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bo
         return
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
     note(f"{path}: taken to the image's voxels, nearest neighbour")
-    if not is_cropped and inside < IN_IMAGE_SHARE * whole:
+    if not is_cropped and inside < IN_IMAGE_FRACTION * whole:
         warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
 
 

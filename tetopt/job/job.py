@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 from tetopt.errors import InputError
 from tetopt.job.options import JobOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
-from tetopt.model.laws import LAW_OPTIONS
+from tetopt.model.mappings import MAPPED_OPTIONS
 from tetopt.public import LARGEST_INTEGER
 from tetopt.system.incoming import json_of
 
@@ -30,8 +30,8 @@ KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a 
 class Job(JobOptions):
     """A run, from files to files: each option of `tetopt mesh` once, under its own name.
 
-    Laws and loads are the texts of the command line; a number may stand for a law of one value. None is the default,
-    which may depend on the image.
+    Mappings and loads are the texts of the command line; a number may stand for a mapping to one value. None is the
+    default, which may depend on the image.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         return float(value)
     if own is int and is_number and abs(value) <= LARGEST_INTEGER and float(value).is_integer():
         return int(value)
-    if own is str and (isinstance(value, str) or (is_number and name in (*LAW_OPTIONS, "background", "bins"))):
+    if own is str and (isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))):
         return value if isinstance(value, str) else f"{value!r}"
     if own is str and name == "weights" and isinstance(value, list | tuple):
         return ",".join(f"{_of_kind(name, float, each):g}" for each in value)

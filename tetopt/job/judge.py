@@ -65,11 +65,11 @@ class Judgement(NamedTuple):
         if self.source is None or self.result is None:
             return wrong
         known = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
-        missed = {name: words for name, words in self.result.missed.items() if name not in known}
+        unmet = {name: words for name, words in self.result.violated.items() if name not in known}
         measured = self.measured
         if not self.is_checked:  # what makes the numbers above meaningless
-            missed, measured = {name: words for name, words in missed.items() if name == "mask"}, {}
-        return wrong + tell_violated(self.result._replace(missed=missed), measured, self.source.mask_word)
+            unmet, measured = {name: words for name, words in unmet.items() if name == "mask"}, {}
+        return wrong + tell_violated(self.result._replace(violated=unmet), measured, self.source.mask_word)
 
 
 def judge(
@@ -103,7 +103,7 @@ def judge(
     if check:
         problems, remarks = _checked(judgement)
         numbers |= {"problems": problems, "remarks": remarks}
-        numbers |= {} if judgement.result is None else {"missed": dict(judgement.result.missed)}
+        numbers |= {} if judgement.result is None else {"violated": dict(judgement.result.violated)}
     return judgement
 
 
@@ -130,7 +130,7 @@ def _measured(loaded: MeshFile, source: Source) -> tuple[ImageFit, MeshingResult
     fit = image_fit(source.image, mesh)
     result = judged(mesh, source.content, of_cell, **_requirements(loaded, source))
     is_uniform = source.content.variance == 0.0
-    fit = fit._replace(E_D=result.history[-1].E_D, E_D_share_of_variance=None if is_uniform else result.share)
+    fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
     measured = fidelity(source.labels, source.mask, mesh, of_cell)
     if not (source.content.is_plain and source.content.region is None):
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())

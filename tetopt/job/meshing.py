@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
-from tetopt.contents.domain import INSIDE_SHARE
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import MeshingResult
@@ -171,9 +171,9 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, job.order or 1)
     if (target := job.target_error) is not None:
-        share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+        fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
         note(
-            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {share:.4g} of the variance in cells; "
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance in cells; "
             f"{ERROR_REACHED * target:.4g} to {target:.4g} is near enough"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
@@ -193,5 +193,5 @@ def _described(task: Task, initial: Mesh) -> str:
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []
     if source.mask is not None:
-        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
+        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_FRACTION).sum())} voxels"]
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"

@@ -34,8 +34,8 @@ from tetopt.model.file import (
     without_results,
 )
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
-from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, other_orders, parse_load
+from tetopt.model.mappings import parse_any_mapping
 from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, odd_units
 from tetopt.model.sets import (
@@ -65,7 +65,7 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     Raises
     ------
     InputError
-        A suffix, law, number of bins, unit or convention that there is not; what needs moduli without any.
+        A suffix, mapping, number of bins, unit or convention that there is not; what needs moduli without any.
     """
     form = format_of(output)
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
@@ -93,11 +93,11 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
     Raises
     ------
     InputError
-        A law, average, number of bins or order that there is not; what needs moduli without any.
+        A mapping, average, number of bins or order that there is not; what needs moduli without any.
     """
-    for name, law in (("young", options.young), ("nu", options.nu), ("density", options.density)):
-        if law is not None:
-            _check_law(law, name)
+    for name, mapping in (("young", options.young), ("nu", options.nu), ("density", options.density)):
+        if mapping is not None:
+            _check_mapping(mapping, name)
             if options.young is None and not has_materials:
                 raise InputError(f"`{name}`: there is no `young`")
     parse_average(options.average or DEFAULT_AVERAGE)
@@ -107,12 +107,12 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
         raise InputError(f"`order`: expected 1 or 2, got {options.order}")
 
 
-def _check_law(text: str, name: str) -> None:
-    """InputError that names the option, for a law that is none."""
+def _check_mapping(text: str, name: str) -> None:
+    """InputError that names the option, for a mapping that is none."""
     try:
-        parse_any_law(text, name)
+        parse_any_mapping(text, name)
     except InputError as error:
-        raise InputError(f"`{name}`: {str(error).removeprefix('law: ')}") from error
+        raise InputError(f"`{name}`: {str(error).removeprefix('mapping: ')}") from error
 
 
 def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:

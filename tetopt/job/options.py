@@ -25,6 +25,7 @@ from tetopt.engine.loop import (
     Boundary,
 )
 from tetopt.engine.paper import Retessellate
+from tetopt.errors import FORMER_NAMES
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
@@ -86,7 +87,8 @@ class LabelledPart(ImagePart):
     """Which part of an image file is read, and what gives labels to a mesh that was made without."""
 
     labels: Annotated[
-        Path | None, Option("LABELS", "Label image: a cell gets the label of most of its voxels, for laws and sets.")
+        Path | None,
+        Option("LABELS", "Label image: a cell gets the label of most of its voxels, for modulus mappings and sets."),
     ] = None
 
 
@@ -152,14 +154,14 @@ class SizeOptions:
         ),
     ] = None
     target_error: Annotated[
-        float | None, Option("T", "As many nodes as leave this share of the image's variance in cells, instead.")
+        float | None, Option("T", "As many nodes as leave this fraction of the image's variance in cells, instead.")
     ] = None
     size_min: Annotated[float | None, Option("MM", "No edge is split into shorter ones.")] = None
-    size_max: Annotated[
-        float | None, Option("MM", "Usual edge of cells, at most: longer ones are split as far as nodes go.")
+    edge_size: Annotated[
+        float | None, Option("MM", "Target for the usual edge: longer ones are split as far as nodes go.")
     ] = None
     edge_max: Annotated[
-        float | None, Option("MM", "No longer edge is made (default 1.4 x a uniform mesh's; with `size_max` none).")
+        float | None, Option("MM", "No longer edge is made (default 1.4 x a uniform mesh's; with `edge_size` none).")
     ] = None
     gradation: Annotated[
         float | None, Option("G", "How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default).")
@@ -213,7 +215,7 @@ class EngineOptions:
         Boundary | None, Option(None, "What the boundary's nodes may do (default slide; with `start` fixed).")
     ] = None
     method: Annotated[
-        Method, Option(None, "fast: gradients, flips, a floor on angles; paper: the scheme of the paper.")
+        Method, Option(None, "fast: gradients, flips, a minimum dihedral angle; paper: the scheme of the paper.")
     ] = "fast"
     shape_power: Annotated[
         float | None,
@@ -276,15 +278,15 @@ class ModelOptions:
     young: Annotated[
         str | None,
         Option(
-            "LAW",
+            "MAPPING",
             'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
             'by label "1=2.1,liver=1.9,*=5", or a file .toml or .csv of such columns.',
         ),
     ] = None
-    nu: Annotated[str | None, Option("LAW", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
-    density: Annotated[str | None, Option("LAW", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")] = (
-        None
-    )
+    nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
+    density: Annotated[
+        str | None, Option("MAPPING", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")
+    ] = None
     average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
         str | None, Option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
@@ -366,7 +368,9 @@ def has_model(options: SolverOptions) -> bool:
 
 def near_hint(name: str, names: Iterable[str]) -> str:
     """Words for the end of a message, if one of the names is near to the one that there is not."""
-    near = get_close_matches(name, names, 1)
+    plain = {each.strip("-").replace("-", "_"): each for each in names}
+    former = plain.get(FORMER_NAMES.get(name.strip("-").replace("-", "_"), ""))
+    near = [former] if former is not None else get_close_matches(name, plain.values(), 1)
     return f"; is {near[0]} meant?" if near else ""
 
 

@@ -110,7 +110,7 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
     job = plan.job
     return {
         "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
-        "lattice": kind_of(plan, ndim), "size_min": job.size_min, "size_max": job.size_max,
+        "lattice": kind_of(plan, ndim), "size_min": job.size_min, "edge_size": job.edge_size,
         "edge_max": job.edge_max, "gradation": job.gradation,
         "sizing": None if job.sizing is None else job.sizing.name,
         **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
@@ -165,7 +165,7 @@ def resolved(job: JobOptions) -> Plan:
     _check_numbers(job)
     check_solver_options(job.output, job)
     mode = _mode(job)
-    for name in ("size_min", "size_max", "edge_max", "gradation", "sizing", "target_error"):
+    for name in ("size_min", "edge_size", "edge_max", "gradation", "sizing", "target_error"):
         if mode != "graded" and getattr(job, name) is not None:
             raise InputError(
                 f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
@@ -309,7 +309,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
 
 
 def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
-    """As many nodes as the targets take, where there are any, and elsewhere their share of the usual number.
+    """As many nodes as the targets take, where there are any, and elsewhere their part of the usual number.
 
     `many` are the nodes in all to a corner of cells.
     """
@@ -317,8 +317,8 @@ def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
         np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
     )
     if limits is not None and limits.has_target:
-        needed, share = nodes_of_sizes(content, limits)
-        corners = needed + (1.0 - share) * corners
+        needed, fraction = nodes_of_sizes(content, limits)
+        corners = needed + (1.0 - fraction) * corners
     return int(np.rint(many * corners))
 
 
@@ -326,7 +326,7 @@ def _limits(job: JobOptions) -> Sizes | None:
     """The limits on sizes, if the options ask for any."""
     field = None if job.sizing is None else read_companion(job.sizing)
     values = {
-        "smallest": job.size_min, "largest": job.size_max, "gradation": job.gradation, "field": field,
+        "smallest": job.size_min, "edge_size": job.edge_size, "gradation": job.gradation, "field": field,
         "longest": job.edge_max,
     }  # fmt: skip
     limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}

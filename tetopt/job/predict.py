@@ -58,8 +58,8 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
     """The same, of files of which only the headers are read.
 
     What shows only in the voxels is taken from a run with the same options, `like`, whose files have been read: the
-    share of the voxels that a mask leaves, the channels of labels, nodes where no number is asked for. Without one it
-    is all voxels, one channel for all labels, and the default number.
+    fraction of the voxels that a mask leaves, the channels of labels, nodes where no number is asked for. Without one
+    it is all voxels, one channel for all labels, and the default number.
 
     Raises
     ------

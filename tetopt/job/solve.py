@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from tetopt.fem.conditioning import Conditioning
     from tetopt.fem.solution import Solution
 
-INTENSITY_LAW = "h"  # an image without a modulus: its intensities are the moduli, as in the paper
+INTENSITY_MAPPING = "h"  # an image without a modulus: its intensities are the moduli, as in the paper
 PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
-SMALL_SHARE = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
+SMALL_FRACTION = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
 
 
 class SolvedModel(NamedTuple):
@@ -58,7 +58,7 @@ def solve_file(
     ----------
     mesh : Path
     image : Path, optional
-        Laws are of its intensities. Without loads its box is compressed, and without a law they are the moduli.
+        Mappings are of its intensities. Without loads its box is compressed, and without a mapping they are the moduli.
     output : Path, optional
         A file of VTK's for the mesh with displacements, strains and stresses.
     model : ModelOptions
@@ -74,7 +74,7 @@ def solve_file(
         Files that cannot be read or do not belong together; a mesh without moduli or loads; one that is not held.
     """
     if image is not None:
-        model = replace(model, young=model.young or INTENSITY_LAW, average=model.average or DEFAULT_AVERAGE)
+        model = replace(model, young=model.young or INTENSITY_MAPPING, average=model.average or DEFAULT_AVERAGE)
     _check_options(image, compress, model, part)
     voxels = None if image is None else read_image(image, part)
     loaded = with_labels(without_results(read_mesh(mesh)), part.labels)
@@ -146,7 +146,7 @@ def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Mode
     """The mesh with all that it is solved with."""
     box = loaded.box if image is None else box_of(image)
     about = {} if box is None else {"box": box_text(box)}
-    return model_of_file(loaded, image, options, about, box, has_units=options.young != INTENSITY_LAW)
+    return model_of_file(loaded, image, options, about, box, has_units=options.young != INTENSITY_MAPPING)
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
@@ -184,7 +184,7 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
         warning(words)
     size = float(np.ptp(model.mesh.points, axis=0).max())
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
-    if moved > SMALL_SHARE * size:
+    if moved > SMALL_FRACTION * size:
         note(
             f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length: small "
             "displacements, which this solves, no longer hold; look at the loads and at what is held, or write a file "

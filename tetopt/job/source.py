@@ -84,15 +84,15 @@ class Source(NamedTuple):
         return self._replace(table=table, about=self.about | words)
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
-        """How well cells with these fields represent each contrast: the share of its variance left within them."""
+        """How well cells with these fields represent each contrast: the fraction of its variance left within them."""
         rows = []
         for number, (path, weight) in enumerate(zip(self.paths, self.weights, strict=True), 1):
             mean, variance = (fields[field if number == 1 else f"{field}_{number}"] for field in ("mean", "variance"))
             count = fields["n_voxels"]
             within = float((count * variance).sum())
             total = within + float((count * (mean - (count * mean).sum() / count.sum()) ** 2).sum())
-            share = within / total if total > 0.0 else None
-            rows.append({"image": path.name, "weight": weight, "E_D_share_of_variance": share})
+            fraction = within / total if total > 0.0 else None
+            rows.append({"image": path.name, "weight": weight, "E_D_fraction_of_variance": fraction})
         return rows
 
 
@@ -142,7 +142,7 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
 
 
 def whose_variance(content: Content) -> str:
-    """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
+    """Of what E_D is a fraction, in words; labels that are an image of their own are its only channels."""
     if content.n_contrasts == 1 and content.n_channels == 1:
         return "the image's variance"
     return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"

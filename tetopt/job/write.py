@@ -148,9 +148,9 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     if has_image and not (source.content.is_plain and source.content.region is None):
         measures["contrasts"] = lambda: source.by_contrast(fields)
     if sizes is not None and sizes.has_target:
-        content, share = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
+        content, factor = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
         measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
-        measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * share)
+        measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * factor)
     if source.mask is not None:
         measures["dropped_components"] = lambda: result.n_dropped
     if (labels := result.labels) is not None:

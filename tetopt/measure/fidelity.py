@@ -1,4 +1,4 @@
-"""How well a mesh represents given labels, or a given mask: overlaps, distances between surfaces, pieces.
+"""How well a mesh represents given labels, or a given mask: overlaps, distances between surfaces, connected components.
 
 A label's surface in the image is its half level: marching cubes at 1/2 of the array that is 1 in the label's voxels and
 0 elsewhere. Its surface in the mesh are the facets between the cells that carry the label and those that do not. The
@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.check import facets_on_box
-from tetopt.contents.domain import INSIDE_SHARE
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
@@ -31,7 +31,7 @@ POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
 MOST_POINTS = 20_000  # on a surface, from which distances are measured
 FEWEST_POINTS = 1_000  # the same on the larger of two surfaces, however small
 POINTS_PER_FACE = 4.0  # on an area as large as a voxel's face: the half level bends no faster than that
-FLAT_AREA_SHARE = 1e-6  # of the square of a triangle's size: one with less area is flat
+FLAT_AREA_FRACTION = 1e-6  # of the square of a triangle's size: one with less area is flat
 # Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1 (Roberts 2018).
 EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
@@ -69,9 +69,9 @@ class LabelFidelity(NamedTuple):
     distance_p95 : float
         95th percentile of the same, mm.
     components : int
-        Pieces of its voxels that hang together by faces.
+        Connected components of its voxels, linked by faces.
     mesh_components : int
-        Pieces of its cells that hang together by facets.
+        Connected components of its cells, linked by facets.
     is_lost : bool
         Nothing of the mesh carries it.
     distance_max : float
@@ -125,11 +125,11 @@ class MaskFidelity(NamedTuple):
     distance_mean_mm, distance_p95_mm, reverse_mean_mm, reverse_p95_mm : float
         The same four in mm.
     components : int
-        Pieces of the voxels that hang together by faces.
+        Connected components of the voxels, linked by faces.
     mesh_components : int
-        Pieces of the cells that hang together by facets.
+        Connected components of the cells, linked by facets.
     euler : int
-        Euler characteristic of the mask's half level: 2 for each closed piece, 2 less for each handle.
+        Euler characteristic of the mask's half level: 2 for each closed component, 2 less for each handle.
     mesh_euler : int
         Of the mesh's boundary; both without what lies on the box, 1 for a disc that ends there.
 
@@ -308,7 +308,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     Returns
     -------
     MaskFidelity
-        Volumes, Dice, distances both ways, pieces, Euler characteristics.
+        Volumes, Dice, distances both ways, connected components, Euler characteristics.
 
     Raises
     ------
@@ -328,7 +328,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     low, high = float(mask.data.min()), float(mask.data.max())
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
-    is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_SHARE
+    is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_FRACTION
     n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
     outer, is_on_box = facets_on_box(mesh, mask)
     ours = FacetSurface(mask.to_index(mesh.points), outer[~is_on_box])
@@ -380,7 +380,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     padded = np.pad(level, 1, mode="edge")
     grid = pyvista.ImageData(dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n))
     grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(order="F")
-    surface = grid.contour([INSIDE_SHARE], scalars="level", compute_normals=False, compute_gradients=False)
+    surface = grid.contour([INSIDE_FRACTION], scalars="level", compute_normals=False, compute_gradients=False)
     listed = surface.faces if n == 3 else surface.lines  # the points of each come after their number
     # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
     # copy, one voxel out, has the same place along the others at the face of the box, half a voxel out.
@@ -556,7 +556,7 @@ def _areas_and_flat(surface: FacetSurface) -> tuple[NDArray[np.float64], NDArray
     size = np.zeros(len(areas))
     for a, b, c in corners:  # not by `max` over an axis of three, which takes five times as long
         np.maximum(size, np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c), out=size)
-    return areas, areas <= FLAT_AREA_SHARE * size**2
+    return areas, areas <= FLAT_AREA_FRACTION * size**2
 
 
 def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
@@ -586,14 +586,14 @@ class ImageFit(NamedTuple):
     """How well the cells of a mesh fit an image."""
 
     E_D: float  # intensity^2 mm^n
-    E_D_share_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
+    E_D_fraction_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
     n_voxels: int  # voxel centres inside
     n_empty_cells: int  # cells without one
     overlap: Overlap | None  # voxels that lie in several cells
 
 
 def image_fit(image: Image, mesh: Mesh) -> ImageFit:
-    """E_D of a mesh, absolute and as share of the variance of the voxels that it covers.
+    """E_D of a mesh, absolute and as a fraction of the variance of the voxels that it covers.
 
     Raises
     ------

@@ -5,8 +5,9 @@ the mesh, so that it is closed. It is compared with a smooth surface of the labe
 surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D. These shrink what is small: a
 perfect ball has 1.16 times their area at a radius of 6 voxels, 1.04 at 12 and 1.01 at 20, a tube 1.15 at 4, 1.07 at 8.
 
-Pieces, holes and cavities are those of the label's inside, without its surface: cells hang together by facets, voxels
-by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge or a node alone has no hole.
+Connected components, holes and cavities are those of the label's inside, without its surface: cells hang together by
+facets, voxels by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge or a node alone has no
+hole.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from tetopt.mesh import Mesh
 FOLD_DEGREES = 60.0  # by which the normals at a ridge turn where it is folded; a dihedral angle under 120 degrees
 NET_ITERATIONS = 16  # of the relaxation of surface nets, and the next: VTK's own values
 NET_VOXELS = {2: 34, 3: 200}  # by dimension: the nets of fewer shrink by half of their area and more
-NET_RELAXATION = 0.5  # the share of the way to the neighbours' mean that a point goes in each
+NET_RELAXATION = 0.5  # the fraction of the way to the neighbours' mean that a point goes in each
 
 
 class LabelInterface(NamedTuple):
@@ -46,7 +47,7 @@ class LabelInterface(NamedTuple):
     area_ratio : float
         Of the two; nan without cells, or of fewer voxels than `NET_VOXELS`.
     folded : float
-        Share of the surface's edges at which it turns by more than 60 degrees; nan without cells.
+        Fraction of the surface's edges at which it turns by more than 60 degrees; nan without cells.
     n_facets : int
         How many facets its surface has.
     nonmanifold_edges : int
@@ -58,7 +59,7 @@ class LabelInterface(NamedTuple):
     nonmanifold_nodes_two_labels : int
         Those around which it meets one other label alone, or the outside alone.
     euler : int
-        Of its voxels' closed surface: 2 (pieces - holes + cavities); the same in 2-D, where no curve has one.
+        Of its voxels' closed surface: 2 (components - holes + cavities); the same in 2-D, where no curve has one.
     mesh_euler : int
         Of its cells' closed surface.
     cavities : int

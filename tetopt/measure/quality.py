@@ -61,7 +61,7 @@ def _errors_of(shape: NDArray[np.float64], n: int) -> QualityErrors:
 
 
 def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): share of cells, (bins,), and edges, (bins + 1,)."""
+    """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): fraction of cells, (bins,), and edges, (bins + 1,)."""
     n = points.shape[1]
     counts, edges = np.histogram(np.minimum(rho(points, cells), 1.0 / n), bins=bins, range=(0.0, 1.0 / n))
     return counts / len(cells), edges

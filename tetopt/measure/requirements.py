@@ -9,7 +9,7 @@ from tetopt.check import beyond_box
 from tetopt.contents.content import Content
 from tetopt.energy.discretization import content_E_D
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.promises import BEYOND_WORDS, promised, requested
+from tetopt.engine.requirements import BEYOND_WORDS, checked, requested
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.mesh import Mesh
 
@@ -23,7 +23,7 @@ def judged(
     target_error: float | None = None,
     is_filled: bool = False,
 ) -> MeshingResult:
-    """A mesh as the result of a run that ended with it: its `missed` and `share` are those of that run.
+    """A mesh as the result of a run that ended with it: its `violated` and `fraction` are those of that run.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def judged(
     labels : (M,) int64, optional
         Label of each cell.
     min_dihedral : float
-        The floor on dihedral angles, degrees; 0 for none.
+        The minimum dihedral angle, degrees; 0 for none.
     target_error : float, optional
         The fraction of the variance that cells may leave unexplained.
     is_filled : bool
@@ -51,9 +51,9 @@ def judged(
     """
     E_D, n_voxels = content_E_D(content, mesh)
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
-    result = promised(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
+    result = checked(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
     result = requested(result, content, target_error, is_filled)
     beyond = float(beyond_box(mesh, content.image).max())
     if (is_filled or content.region is not None) and beyond > ON_SIDE_VOXELS:
-        return result._replace(missed={**result.missed, "box": BEYOND_WORDS.format(beyond)})
+        return result._replace(violated={**result.violated, "box": BEYOND_WORDS.format(beyond)})
     return result

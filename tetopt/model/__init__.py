@@ -1,1 +1,1 @@
-"""What a solver is told beside the mesh: named sets, laws and materials, loads, units."""
+"""What a solver is told beside the mesh: named sets, modulus mappings and materials, loads, units."""

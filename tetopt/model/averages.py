@@ -1,8 +1,8 @@
 """Moduli of cells: averages over their voxels.
 
-Eq. (2) wants the *mean of the modulus field* over each cell. A law from intensity to modulus is therefore applied to
-the voxels first and the average taken afterwards; the law of the mean intensity is another number wherever the law is
-curved and the cell is not uniform.
+Eq. (2) wants the *mean of the modulus field* over each cell. A mapping from intensity to modulus is therefore applied
+to the voxels first and the average taken afterwards; the mapping of the mean intensity is another number wherever the
+mapping is curved and the cell is not uniform.
 
 The mean is what a mixture has if all of it is strained alike (Voigt, Annalen der Physik 274, 1889, 573-587), and an
 upper bound; the harmonic mean what it has if all of it is stressed alike (Reuss, ZAMM 9, 1929, 49-58), and a lower
@@ -24,7 +24,7 @@ from tetopt.geometry.quadratic import gauss_rule
 from tetopt.geometry.simplex import centroids, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.laws import Law, law_values, young_from
+from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
 
 DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md), but in `tetopt paper`, which keeps Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
@@ -79,7 +79,7 @@ def parse_average(text: str) -> Average:
     return Average(f"power:{power:g}", power)
 
 
-def young_image(image: Image, law: Law) -> Image:
+def young_image(image: Image, mapping: ModulusMapping) -> Image:
     """The modulus field: `young_from` of every voxel, kPa, at the image's place in the world.
 
     It can be meshed in place of the image, so that the cells follow the moduli.
@@ -89,18 +89,18 @@ def young_image(image: Image, law: Law) -> Image:
     InputError
         As `young_from`.
     """
-    return Image(young_from(law, image.data), image.affine)
+    return Image(young_from(mapping, image.data), image.affine)
 
 
-def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean") -> NDArray[np.float64]:
+def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean") -> NDArray[np.float64]:
     """Modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
     Parameters
     ----------
     image : Image
     mesh : Mesh
-    law : callable, (K, 2) table or None
-        From intensity to kPa, see `tetopt.model.laws.law_values`.
+    mapping : callable, (K, 2) table or None
+        From intensity to kPa, see `tetopt.model.mappings.mapped_values`.
     average : str
         See `parse_average`. "mean" is Eq. (2). With "nodes" it is the mean of `node_young` over the cell's corners, and
         so over the cell; with "gauss" the geometric mean.
@@ -116,33 +116,34 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
     """
     parsed = parse_average(average)
     if parsed.place == "nodes":
-        return gauss_young(node_young(image, mesh, law), mesh, 1)[:, 0]
+        return gauss_young(node_young(image, mesh, mapping), mesh, 1)[:, 0]
     seen, owner = _seen(image, mesh)
-    field = young_image(seen, law)
+    field = young_image(seen, mapping)
     _check_above_zero(parsed, image, field, owner)
     return _of_cells(field, mesh, owner, parsed.power)
 
 
-def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
+def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np.float64]:
     """The mean over each cell of any other quantity, such as Poisson's ratio or the density; it may be negative.
 
     Raises
     ------
     InputError
-        As `law_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
+        As `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
     """
     seen, owner = _seen(image, mesh)
-    values = law_values(law, seen.data)
+    values = mapped_values(mapping, seen.data)
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
         raise InputError(
-            f"law: it has no value at intensity {at:g}; give one (`nu`, `density`) defined over all intensities within "
+            f"mapping: it has no value at intensity {at:g}; give one (`nu`, `density`) defined over all intensities "
+            f"within "
             "the mesh"
         )
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
 
 
-def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
+def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDArray[np.float64]:
     """A modulus for each node, (N,) float64, kPa, that of the cells to be linear between them.
 
     The geometric mean of the voxels in the cells around the node, each weighted by the node's hat function at its
@@ -154,7 +155,7 @@ def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
         As `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
     """
     seen, owner = _seen(image, mesh)
-    field = young_image(seen, law)
+    field = young_image(seen, mapping)
     _check_above_zero(parse_average("nodes"), image, field, owner)
     n_nodes = len(mesh.points)
     weight, total = np.zeros(n_nodes), np.zeros(n_nodes)
@@ -176,7 +177,7 @@ def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
 
 
 def element_young(
-    image: Image, mesh: Mesh, law: Law = None, average: str = "mean", order: int = 1
+    image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
 ) -> NDArray[np.float64]:
     """Moduli for `tetopt.fem.elasticity.stiffness` of an order: `cell_young` (M,), or at Gauss points (M, Q), kPa.
 
@@ -192,11 +193,11 @@ def element_young(
     """
     place = parse_average(average).place
     if place == "nodes":
-        return gauss_young(node_young(image, mesh, law), mesh, order)
+        return gauss_young(node_young(image, mesh, mapping), mesh, order)
     if place == "cells" or order == 1:
-        return cell_young(image, mesh, law, average)
+        return cell_young(image, mesh, mapping, average)
     seen, owner = _seen(image, mesh)
-    field = young_image(seen, law)
+    field = young_image(seen, mapping)
     _check_above_zero(parse_average(average), image, field, owner)
     places, _ = gauss_rule(mesh.ndim, order)
     part = np.full(len(owner), -1)
@@ -222,7 +223,7 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
 def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
     """The image as the mesh sees it, and the cell of each voxel, (V,), -1 outside.
 
-    Voxels whose value no average takes get that of one which some do: a law need not be one for the air around an
+    Voxels whose value no average takes get that of one which some do: a mapping need not be one for the air around an
     organ. Taken are those in cells, and those nearest to nodes and centroids, which stand in for cells without any.
     """
     owner = cell_of_voxel(image, mesh).ravel()

@@ -25,8 +25,8 @@ from tetopt.model.file import (
     without_results,
 )
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, labels_of, table_of_words, table_words
-from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_load, parse_loads
+from tetopt.model.mappings import ByLabel, ModulusMapping, has_column, mapped_values, parse_any_mapping, young_from
 from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, density_of, materials
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
@@ -36,9 +36,9 @@ def build_model(
     mesh: Mesh | MeshFile,
     image: Image | None = None,
     *,
-    young: str | float | NDArray[np.float64] | Law | ByLabel = None,
-    nu: str | float | NDArray[np.float64] | Law | ByLabel = None,
-    density: str | float | NDArray[np.float64] | Law | ByLabel = None,
+    young: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
+    nu: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
+    density: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
     average: str = DEFAULT_AVERAGE,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
@@ -59,17 +59,17 @@ def build_model(
         nodes, labels and their names, sets, moduli, loads, the image's box, and texts of what it was made from. What a
         solver found stays if moduli and loads do.
     image : Image, optional
-        Its intensities are what laws are of, and its box's faces become sets.
-    young, nu : number, (M,) array, law or text, optional
+        Its intensities are what mappings are of, and its box's faces become sets.
+    young, nu : number, (M,) array, mapping or text, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
-        a law of the intensity or of the label (`tetopt.model.laws.parse_any_law`), of which with an image an average
-        over the voxels of the cell is taken, and else its value at the cell's "mean". Without `young` the model has
-        no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
-    density : number, (M,) array, law or text, optional
+        a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`), of which with an image
+        an average over the voxels of the cell is taken, and else its value at the cell's "mean". Without `young` the
+        model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
+    density : number, (M,) array, mapping or text, optional
         kg/m3, above 0, likewise; without it the column "density" of the file that `young` names, or none. Gravity
         needs it.
     average : str
-        Of a law of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
+        Of a mapping of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
         With "gauss" and quadratic cells moduli vary in a cell for `tetopt.fem.solution.solve`; files have one.
         Ratios and densities are always the mean.
     sets : iterable of str
@@ -92,7 +92,7 @@ def build_model(
         Of the image that the mesh was made from; by default of `image`.
     about : dict, optional
         Texts for the file's head. Its "label_table", a `LabelTable` or what `tetopt.model.labels.table_words` makes of
-        one, is what labels are called, in laws and in the standard sets.
+        one, is what labels are called, in mappings and in the standard sets.
 
     Returns
     -------
@@ -178,9 +178,9 @@ def _said(answer: tuple[Any, str]) -> Any:
     return answer[0]
 
 
-def _to_be_kept(loaded: MeshFile, laws: list[Any], loads: Iterable[str]) -> MeshFile:
+def _to_be_kept(loaded: MeshFile, mappings: list[Any], loads: Iterable[str]) -> MeshFile:
     """The file without what a solver found, if moduli, densities or loads are to be others."""
-    return without_results(loaded) if loads or any(law is not None for law in laws) else loaded
+    return without_results(loaded) if loads or any(mapping is not None for mapping in mappings) else loaded
 
 
 def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
@@ -215,7 +215,7 @@ def _sets(
 
 
 def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: str) -> Materials:
-    """The materials of laws; ratio and density by default of the columns of the file that the modulus names."""
+    """The materials of mappings; ratio and density by default of the columns of the file that the modulus names."""
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
@@ -229,21 +229,23 @@ def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: s
 def _varying_moduli(
     young: Any, mesh: Mesh, image: Image | None, average: str, order: int, bins: int | None
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """`node_young`, and moduli at Gauss points, of a law of the intensity; None but where the average has them."""
-    law: Any = parse_any_law(young) if isinstance(young, str) else young
+    """`node_young`, and moduli at Gauss points, of a mapping of the intensity; None but where the average has them."""
+    mapping: Any = parse_any_mapping(young) if isinstance(young, str) else young
     place = parse_average(average).place
-    if image is None or not (callable(law) or np.ndim(law) == 2):
+    if image is None or not (callable(mapping) or np.ndim(mapping) == 2):
         return None, None
     if place == "nodes" and bins is not None:
         raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
     return (
-        node_young(image, mesh, law) if place == "nodes" else None,
-        element_young(image, mesh, law, average, order) if place == "gauss" and order == 2 and bins is None else None,
+        node_young(image, mesh, mapping) if place == "nodes" else None,
+        element_young(image, mesh, mapping, average, order)
+        if place == "gauss" and order == 2 and bins is None
+        else None,
     )
 
 
 class _ModelCells(NamedTuple):
-    """What laws are of."""
+    """What mappings are of."""
 
     mesh: Mesh
     image: Image | None
@@ -254,17 +256,17 @@ class _ModelCells(NamedTuple):
 
 def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> NDArray[np.float64]:
     """The value of each cell, or one for all."""
-    law: Any = parse_any_law(value, name) if isinstance(value, str) else value
-    if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:
-        return np.asarray(law, dtype=np.float64)
-    if isinstance(law, ByLabel):
-        return by_label(law, cells.labels, cells.names)
-    if cells.image is not None:  # the law of each voxel, and then the average, as Eq. (2) wants it
-        by_voxel = (cells.image, cells.mesh, law)
+    mapping: Any = parse_any_mapping(value, name) if isinstance(value, str) else value
+    if not callable(mapping) and not isinstance(mapping, ByLabel) and np.ndim(mapping) < 2:
+        return np.asarray(mapping, dtype=np.float64)
+    if isinstance(mapping, ByLabel):
+        return by_label(mapping, cells.labels, cells.names)
+    if cells.image is not None:  # the mapping of each voxel, and then the average, as Eq. (2) wants it
+        by_voxel = (cells.image, cells.mesh, mapping)
         return cell_young(*by_voxel, average) if name == "young" else cell_values(*by_voxel)
     if cells.mean is None:
-        raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (`image`)")
+        raise InputError(f"{name}: a mapping of the intensity, but the mesh has no means; give the image (`image`)")
     if name == "young" and average != DEFAULT_AVERAGE:
         raise InputError(f"average: {average} is over the image's voxels; give the image (`image`)")
-    # The law of each cell's mean: the same only where the law is linear over the cell.
-    return young_from(law, cells.mean) if name == "young" else law_values(law, cells.mean)
+    # The mapping of each cell's mean: the same only where the mapping is linear over the cell.
+    return young_from(mapping, cells.mean) if name == "young" else mapped_values(mapping, cells.mean)

@@ -12,8 +12,8 @@ from tetopt import notebook
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
 from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words
-from tetopt.model.laws import checked_young
 from tetopt.model.loads import load_words, parse_load
+from tetopt.model.mappings import checked_young
 from tetopt.model.materials import BinningError
 from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
 from tetopt.model.sets import Box, Sets, label_sets, merged_sets, standard_sets
@@ -174,12 +174,12 @@ def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
 
 
 def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any) -> tuple[Any, Any, Any]:
-    """Laws of modulus, ratio and density; without the first those that the cells have, whichever is not stated."""
+    """Mappings of modulus, ratio and density; without the first those that the cells have, whichever is not stated."""
     if young is not None or "young" not in cell_data:
         return young, nu, density
     stated = {"nu": nu, "density": density}
-    for name, law in stated.items():
-        if law is None and name in cell_data:
+    for name, mapping in stated.items():
+        if mapping is None and name in cell_data:
             stated[name] = np.asarray(cell_data[name], dtype=np.float64)
     return np.asarray(cell_data["young"], dtype=np.float64), stated["nu"], stated["density"]
 

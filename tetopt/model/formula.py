@@ -54,11 +54,11 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
             raise
         raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
 
-    def law(h: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mapping(h: NDArray[np.float64]) -> NDArray[np.float64]:
         with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
             return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
-    return law
+    return mapping
 
 
 def _shown(text: str) -> str:

@@ -21,7 +21,7 @@ from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
 
-PLANE_SHARE = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
+PLANE_FRACTION = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
 MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
 # By kind, what follows SET: how the numbers are written (n stands for one a dimension), and their unit.
@@ -257,7 +257,7 @@ def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]
         areas = area_vectors(mesh, sets.facets[name])
         total = sign * areas.sum(axis=0)
         size = float(np.sqrt((total**2).sum()))
-        if size >= PLANE_SHARE * float(np.sqrt((areas**2).sum(axis=1)).sum()):
+        if size >= PLANE_FRACTION * float(np.sqrt((areas**2).sum(axis=1)).sum()):
             return np.asarray(total / size)
     return np.eye(mesh.ndim)[-1]
 
@@ -302,22 +302,22 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
     order : {1, 2}
         Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D a facet's area A then goes to the
         midpoints of its edges, A/3 each, and nothing to its corners; in 2-D an edge's length is shared as Simpson's
-        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same share.
+        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same part.
     """
     areas = np.sqrt((area_vectors(mesh, rows) ** 2).sum(axis=1))
     if order == 1:
         nodes = facet_triples(mesh.cells, rows)
-        shares = np.full(mesh.ndim, 1.0 / mesh.ndim)
+        fractions = np.full(mesh.ndim, 1.0 / mesh.ndim)
     else:
         nodes = quadratic_facet_nodes(quadratic(mesh.points, mesh.cells)[1], rows)
-        shares = np.array([0.0] * 3 + [1.0 / 3.0] * 3 if mesh.ndim == 3 else [1.0 / 6.0, 1.0 / 6.0, 4.0 / 6.0])
-    return nodes, areas[:, None] * shares
+        fractions = np.array([0.0] * 3 + [1.0 / 3.0] * 3 if mesh.ndim == 3 else [1.0 / 6.0, 1.0 / 6.0, 4.0 / 6.0])
+    return nodes, areas[:, None] * fractions
 
 
 def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """What a pressure or traction does to nodes: their numbers (P,), ascending, and forces (P, n), mN if it is in kPa.
 
-    Nodes whose share is 0 are left out.
+    Nodes whose part is 0 are left out.
     """
     rows = sets.facets[load.set_name]
     nodes, weights = facet_weights(mesh, rows, order)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError
 from tetopt.model.labels import label_words, labels_named
-from tetopt.model.laws import ByLabel, checked_young
+from tetopt.model.mappings import ByLabel, checked_young
 
 DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells can still follow: they lock nearer to 0.5
 Spacing = Literal["equal", "quantile", "log"]
@@ -147,13 +147,13 @@ def cells_of(table: Materials) -> list[NDArray[np.int64]]:
 
 
 def by_label(
-    law: ByLabel, labels: NDArray[np.integer] | None, names: Mapping[int, str] | None = None
+    mapping: ByLabel, labels: NDArray[np.integer] | None, names: Mapping[int, str] | None = None
 ) -> NDArray[np.float64]:
     """The value that each cell's label has, (M,) float64.
 
     Parameters
     ----------
-    law : ByLabel
+    mapping : ByLabel
         A name in it is that of all labels that are called so (`tetopt.model.labels.labels_named`).
     labels : (M,) integers or None
     names : mapping of label to text, optional
@@ -167,19 +167,19 @@ def by_label(
         raise InputError("values by label: the mesh has no labels; give the label image (`labels`)")
     names = names or {}
     values: dict[int, float] = {}
-    for key, value in law.values.items():
+    for key, value in mapping.values.items():
         for label in [key] if isinstance(key, int) else labels_named(key, names):
             if label in values:
                 raise InputError(f"values by label: label {label_words(label, names)} has two values; give each once")
             values[label] = value
     kinds, which = np.unique(labels, return_inverse=True)
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
-    if missing and law.rest is None:
+    if missing and mapping.rest is None:
         raise InputError(
-            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has {', '.join(missing)} "
+            f"values by label: given for {', '.join(map(str, mapping.values))}, the mesh also has {', '.join(missing)} "
             f"({len(missing)} more); give these, too, or all of them as *=VALUE"
         )
-    return np.array([values.get(label, law.rest) for label in kinds.tolist()], dtype=np.float64)[which.ravel()]
+    return np.array([values.get(label, mapping.rest) for label in kinds.tolist()], dtype=np.float64)[which.ravel()]
 
 
 def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:

@@ -261,13 +261,13 @@ def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[n
     """
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     centres = mesh.points[facet_triples(mesh.cells, boundary)].mean(axis=1)
-    areas, share = area_vectors(mesh, boundary), (centres - low) / (high - low)
+    areas, fraction = area_vectors(mesh, boundary), (centres - low) / (high - low)
     faced = np.abs(areas).argmax(axis=1)
     sets = {}
     for axis, (name_low, name_high) in enumerate(FACE_NAMES[mesh.ndim]):
         is_faced = faced == axis
-        sets[name_low] = boundary[is_faced & (areas[:, axis] < 0.0) & (share[:, axis] <= SIDE_DEPTH)]
-        sets[name_high] = boundary[is_faced & (areas[:, axis] > 0.0) & (share[:, axis] >= 1.0 - SIDE_DEPTH)]
+        sets[name_low] = boundary[is_faced & (areas[:, axis] < 0.0) & (fraction[:, axis] <= SIDE_DEPTH)]
+        sets[name_high] = boundary[is_faced & (areas[:, axis] > 0.0) & (fraction[:, axis] >= 1.0 - SIDE_DEPTH)]
     return sets
 
 

@@ -1,7 +1,7 @@
 """Which cells go to which part in a round, and the whole put together again.
 
 Parts are boxes of about equal work: the cells' centroids are divided by planes across the axes, one axis after the
-other, each time into shares of equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than
+other, each time into slabs of equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than
 two at a time). A part's surface follows its cells. Every round the planes lie elsewhere, so that what a part shared
 with others, and had to leave as it was, is inside of one in the next. A curve through the cells (Morton's) would be one
 sort, but its parts have ragged surfaces or two pieces, and boxes of voxels up to the whole volume.
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# By which share of a part's width the planes of each round lie further along every axis.
+# By which fraction of a slab's width the planes of each round lie further along every axis.
 ROUND_SHIFTS = (0.0, 0.5, 0.25, 0.75)
 
 
@@ -37,7 +37,7 @@ class Piece(NamedTuple):
 
 
 def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
-    """Numbers of shares along each axis, at least `n_parts` parts in all, so that these are as near to cubes as can be.
+    """Numbers of slabs along each axis, at least `n_parts` parts in all, so that these are as near to cubes as can be.
 
     Examples
     --------
@@ -62,9 +62,9 @@ def cut(
     weights : (M,) float64
         What each cell is of a part's work.
     counts : sequence of three int
-        Shares along each axis.
+        Slabs along each axis.
     shift : float
-        0 to 1, of a share: where the first plane lies. Unless it is 0 there is one more share along each axis that is
+        0 to 1, of a slab: where the first plane lies. Unless it is 0 there is one more slab along each axis that is
         divided at all, the first and the last of which are smaller.
     """
     part = np.zeros(len(centroids), dtype=np.int64)
@@ -78,9 +78,9 @@ def cut(
         before = np.repeat(np.concatenate([[0.0], total[start[1:] - 1]]), np.diff(np.append(start, len(order))))
         whole = np.bincount(part, weights)
         at = (total - 0.5 * weights[order] - before) / whole[part[order]]  # 0 to 1 within its part
-        share = np.empty(len(order), dtype=np.int64)
-        share[order] = np.floor(at * count + (1.0 - shift) * (shift > 0.0)).astype(np.int64)
-        part = part * (count + 1) + share
+        slab = np.empty(len(order), dtype=np.int64)
+        slab[order] = np.floor(at * count + (1.0 - shift) * (shift > 0.0)).astype(np.int64)
+        part = part * (count + 1) + slab
     return np.unique(part, return_inverse=True)[1].astype(np.int64)
 
 

@@ -54,14 +54,14 @@ class Numbers(NamedTuple):
     """What came of a part, besides its mesh."""
 
     of: str  # checksum of what it was made of
-    E: float  # its share
+    E: float  # its part of the whole's
     E_G: float
     E_D: float
     squares: float
     n_voxels: int
     n_nodes: int
     movement: float  # of the last iteration, as in a `IterationRecord`
-    E_before: float  # its share to begin with
+    E_before: float  # its part of the whole's, to begin with
 
 
 def box_of_ticks(

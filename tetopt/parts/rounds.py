@@ -2,7 +2,7 @@
 
 Each round moves and exchanges everything but what parts share, which is a fifth of the nodes in parts of 5,000; the
 next one's planes lie elsewhere. Each part is normalised by the whole initial mesh, so that what it wins is what E falls
-by, and keeps as many nodes as it has, or its share of those that are still to come. What came of a round does not
+by, and keeps as many nodes as it has, or its part of those that are still to come. What came of a round does not
 depend on who ran its parts, nor on how many at a time.
 """
 
@@ -22,9 +22,9 @@ from tetopt.contents.content import Content
 from tetopt.contents.statistics import Statistics, statistics
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
-from tetopt.engine.fast import EXCHANGING_SHARE
+from tetopt.engine.fast import EXCHANGING_FRACTION
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.promises import promised_in_box
+from tetopt.engine.requirements import checked_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
@@ -192,7 +192,7 @@ def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics 
     sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
     settings = PartSettings(
         request.k_D, request.shape_power, request.min_dihedral, request.tolerance,
-        _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_SHARE * request.iterations) if request.k_D > 0.0 else 0,
+        _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_FRACTION * request.iterations) if request.k_D > 0.0 else 0,
         sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, of_image.noise,
     )  # fmt: skip
     noted = {"settings": settings._asdict(), "statistics": of_image._asdict(), "history": []}
@@ -230,7 +230,7 @@ def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np
 
 
 def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
-    """Shares along each axis: so many that no part holds too much, whatever machine it is."""
+    """Slabs along each axis: so many that no part holds too much, whatever machine it is."""
     mesh = load_arrays(run.folder / INITIAL_NAME)[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     fewest = ceil(_weights(index, mesh["cells"]).sum())
@@ -351,5 +351,5 @@ def _finished(
         initial=_initial(run, state), nodes=run.request.nodes,
         seconds_run=time.perf_counter() - run.begin,
     )  # fmt: skip
-    result = promised_in_box(result, run.image, run.request.min_dihedral)
+    result = checked_in_box(result, run.image, run.request.min_dihedral)
     return Parted(result, fields, mesh.part, Statistics(**state.known["statistics"]), run.image)

@@ -8,8 +8,8 @@ const PAGE_TILES = 120; // likewise of pictures alone, which are what takes the 
 const BINS = 24;
 const CHART = { width: 230, height: 74 };
 // What is to be looked at first; what failed has a table of its own above.
-const STATUSES = ["missed", "done", "missing", "failed"];
-const WORDS = { failed: "failed", missing: "not run", missed: "promise missed", done: "done" };
+const STATUSES = ["violated", "done", "missing", "failed"];
+const WORDS = { failed: "failed", missing: "not run", violated: "requirement violated", done: "done" };
 const STEPS = {
   mm: data.volume === "mm^2" ? [[1e2, "cm²"], [1, "mm²"]] : [[1e6, "l"], [1e3, "ml"], [1, "mm³"]],
   bytes: [[1e9, "GB"], [1e6, "MB"], [1, "bytes"]],
@@ -116,7 +116,7 @@ function pictureOf(r) {
 }
 
 function oddOf(row) {
-  const own = row[FLAGS].filter(([, column]) => column !== "missed"); // its reason says so
+  const own = row[FLAGS].filter(([, column]) => column !== "violated"); // its reason says so
   const words = own.map(([each]) => element("div", { className: "flag", textContent: each }));
   if (row[FLAG_COUNT] > row[FLAGS].length) words.push(element("div", { textContent: `and ${row[FLAG_COUNT] - row[FLAGS].length} more` }));
   if (row[STATUS] !== "done") words.unshift(element("div", { className: "bad", textContent: row[REASON] }));
@@ -202,10 +202,10 @@ function binsOf(c) {
     return common.map(([text]) => ({ words: text, holds: (value) => value === text }));
   }
   values.sort((a, b) => a - b);
-  const share = (part) => values[Math.round(part * (values.length - 1))];
+  const fraction = (part) => values[Math.round(part * (values.length - 1))];
   // What lies far off would leave one bar for all others: it goes into the first and the last.
-  const reach = 3 * (share(0.75) - share(0.25)) || Infinity;
-  let [low, high] = [Math.max(values[0], share(0.25) - reach), Math.min(values[values.length - 1], share(0.75) + reach)];
+  const reach = 3 * (fraction(0.75) - fraction(0.25)) || Infinity;
+  let [low, high] = [Math.max(values[0], fraction(0.25) - reach), Math.min(values[values.length - 1], fraction(0.75) + reach)];
   const [isCutBelow, isCutAbove] = [values[0] < low, values[values.length - 1] > high];
   const isLog = column.isLog && low > 0 && high > 10 * low;
   const [to, from] = isLog ? [Math.log, Math.exp] : [(x) => x, (x) => x];

@@ -30,8 +30,8 @@ FIELD_UNITS = {
 LABEL_FIELD = "label"  # the cell data that a table's names and colours are of, and that labels are chosen by
 DISPLACEMENT = "displacement"  # the point data by which the mesh is deformed
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
-ROUNDED_SHARE = 1e-9  # of the upper limit: a lower one within it is 0 but for rounding
-SEEN_SHARE = 0.05  # of the mesh's diagonal: about so long the largest displacement is drawn at first, to be seen
+ROUNDED_FRACTION = 1e-9  # of the upper limit: a lower one within it is 0 but for rounding
+SEEN_FRACTION = 0.05  # of the mesh's diagonal: about so long the largest displacement is drawn at first, to be seen
 MOST_TIMES = 5.0  # that: the cells' shapes are lost beyond
 ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # of which, and powers of ten, a factor is one
 
@@ -159,9 +159,9 @@ def warp_factors(shown: Exhibit) -> tuple[float, float]:
     """By what displacements are multiplied at first, so that they are seen (1 or more), and at most."""
     largest = max((float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()), default=0.0)
     diagonal = float(np.sqrt((np.ptp(shown.mesh.points, axis=0) ** 2).sum()))
-    if largest <= ROUNDED_SHARE * diagonal:  # it rests
+    if largest <= ROUNDED_FRACTION * diagonal:  # it rests
         return 1.0, MOST_TIMES
-    factor = SEEN_SHARE * diagonal / largest
+    factor = SEEN_FRACTION * diagonal / largest
     power = 10.0 ** np.floor(np.log10(factor))
     first = max(1.0, power * min(ROUND_NUMBERS, key=lambda number: abs(np.log(factor / power / number))))
     return float(first), MOST_TIMES * float(first)
@@ -225,7 +225,7 @@ def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: Labe
     if len(finite) == 0:
         return Field(name, unit, values, (0.0, 1.0), [], at_nodes)
     low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
-    low = 0.0 if abs(low) < ROUNDED_SHARE * high else low
+    low = 0.0 if abs(low) < ROUNDED_FRACTION * high else low
     limits = (low, high) if high > low else grey_limits([finite])
     is_quantity = unit or at_nodes is not None
     categories = [] if is_quantity else _categories(finite, table)

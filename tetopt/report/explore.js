@@ -59,7 +59,7 @@ function explore(gl, data, notes) {
 
   const state = {
     field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: data.axis, at: 0, isTurned: false, isWhole: false,
-    inside: "cells", share: 0.35, set: -1, picked: -1, warp: firstWarp, lines: "cells",
+    inside: "cells", fraction: 0.35, set: -1, picked: -1, warp: firstWarp, lines: "cells",
     step: displacements.length ? displacements[0].step : 0,
   };
   const camera = { ...facing(), ...WHOLE };
@@ -134,8 +134,8 @@ function explore(gl, data, notes) {
   }
 
   const redraw = redrawing(() => {
-    const share = state.inside === "image" ? -1 : state.inside === "cells" || !image ? 1 : state.share;
-    drawn.frame(fitted(canvas), camera, plane(), share, state.picked, false);
+    const fraction = state.inside === "image" ? -1 : state.inside === "cells" || !image ? 1 : state.fraction;
+    drawn.frame(fitted(canvas), camera, plane(), fraction, state.picked, false);
     drawTriad();
     canvas.dataset.drawn = "1";
   });
@@ -377,8 +377,8 @@ function explore(gl, data, notes) {
     press("inside", state.inside);
     press("lines", state.lines);
     $("sharing").hidden = state.inside !== "both";
-    $("share").value = state.share;
-    $("share-text").textContent = `${Math.round(100 * state.share)} %`;
+    $("fraction").value = state.fraction;
+    $("fraction-text").textContent = `${Math.round(100 * state.fraction)} %`;
   }
 
   function change(changes) {
@@ -447,8 +447,8 @@ function explore(gl, data, notes) {
     redraw();
   }
 
-  function step(share) {
-    if (state.axis >= 0) cutAt(state.at + share * size[state.axis]);
+  function step(fraction) {
+    if (state.axis >= 0) cutAt(state.at + fraction * size[state.axis]);
   }
 
   const keys = {
@@ -484,7 +484,7 @@ function explore(gl, data, notes) {
   choose("inside", [["mesh", "cells"], ["image", "image"], ["both", "both"]], (inside) => change({ inside }));
   choose("lines", [["lines of cells", "cells"], ["of labels", "labels"]], (lines) => change({ lines }));
   $("lines").hidden = labelling < 0;
-  $("share").addEventListener("input", () => change({ share: Number($("share").value) }));
+  $("fraction").addEventListener("input", () => change({ fraction: Number($("fraction").value) }));
   choose("from", Object.keys(FROM).map((letter) => [letter, letter]), (letter) => {
     const [yaw, pitch] = FROM[letter].map((quarters) => quarters * Math.PI / 2);
     look({ yaw, pitch });

@@ -3,7 +3,7 @@
 const NO_LEVEL = -1e6;  // of a node without a value
 const FRAGMENT = `${SHADING}
   const float NO_LEVEL = ${NO_LEVEL.toFixed(1)};
-  uniform int kind; uniform vec4 plane; uniform float share; uniform bool isPicking; uniform uint picked;
+  uniform int kind; uniform vec4 plane; uniform float fraction; uniform bool isPicking; uniform uint picked;
   uniform bool isNodal; uniform vec3 noValue; uniform sampler2D table; uniform sampler2D colours;
   uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
   const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3, GLASS = 4;
@@ -41,7 +41,7 @@ const FRAGMENT = `${SHADING}
     }
     vec3 own = isNodal ? atNodes() : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
     vec4 below = kind == SECTION ? grey(rest) : vec4(0.0);  // the image is moved along
-    float seenOwn = mix(1.0, share, below.a);
+    float seenOwn = mix(1.0, fraction, below.a);
     vec3 fill = mix(below.rgb, own, seenOwn) * lit;
     // Lines that show on any cell: dark, on dark cells light, over the image orange.
     vec3 ink = mix(vec3(0.5), vec3(0.05), smoothstep(0.1, 0.3, dot(fill, vec3(0.3, 0.6, 0.1))));
@@ -104,15 +104,15 @@ function renderer(gl, image, radius, depth, table, noValue) {
   gl.uniform3fv(at("shape"), image ? shape : [0, 0, 0]);
   if (image) gl.uniformMatrix4fv(at("toIndex"), false, image.toIndex);
 
-  const frame = (size, camera, plane, share, picked, isPicking) => {
+  const frame = (size, camera, plane, fraction, picked, isPicking) => {
     gl.clearColor(...(isPicking ? [0, 0, 0, 0] : [1, 1, 1, 1]));
     clear(size, camera, radius, depth);
     gl.uniform4fv(at("plane"), plane);
-    gl.uniform1f(at("share"), share);
+    gl.uniform1f(at("fraction"), fraction);
     gl.uniform1ui(at("picked"), picked + 1);
     gl.uniform1i(at("isPicking"), isPicking ? 1 : 0);
     for (const [name, kind] of Object.entries(KINDS)) {
-      if (isPicking ? name === "slice" || name === "set" : name === "section" && share < 0) continue;
+      if (isPicking ? name === "slice" || name === "set" : name === "section" && fraction < 0) continue;
       if (name === "glass") continue;  // last
       // The slice lies behind the cells cut by its plane, a highlighted set before the facets it is made of; these have
       // the same corners, so a few steps of depth are enough, and steep ones do not come through others.

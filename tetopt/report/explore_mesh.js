@@ -133,11 +133,11 @@ function section(mesh, isShown, axis, at, levels, labels) {
   const { points, rest, cells } = mesh;
   const triangles = new Triangles(64, true);
   const between = (i, j) => {
-    const share = (at - points[3 * i + axis]) / (points[3 * j + axis] - points[3 * i + axis]);
-    const along = (list) => [0, 1, 2].map((k) => list[3 * i + k] + share * (list[3 * j + k] - list[3 * i + k]));
+    const fraction = (at - points[3 * i + axis]) / (points[3 * j + axis] - points[3 * i + axis]);
+    const along = (list) => [0, 1, 2].map((k) => list[3 * i + k] + fraction * (list[3 * j + k] - list[3 * i + k]));
     const place = along(points);
     place[axis] = at;
-    return [...place, levels ? levels[i] + share * (levels[j] - levels[i]) : 0, rest === points ? place : along(rest)];
+    return [...place, levels ? levels[i] + fraction * (levels[j] - levels[i]) : 0, rest === points ? place : along(rest)];
   };
   let [nPolygons, nLines] = [0, 0];
   for (let cell = 0; cell < mesh.count; cell++) {

@@ -41,7 +41,7 @@ DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels are st
 SLICE_WIDTH_INCHES = 4.2  # of the widest slice of a figure of several planes: two fill a page
 SLICES_HEIGHT_INCHES = 12.0  # of all its planes over each other, which one page can hold
 LETTER_INCHES = 0.075  # of a legend's texts, in 9 points
-NUMBER_RADIUS_SHARE = 0.014  # of that width: the radius that a label's number takes in 5 points
+NUMBER_RADIUS_FRACTION = 0.014  # of that width: the radius that a label's number takes in 5 points
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
@@ -166,7 +166,7 @@ def label_figure(
     for (left, right, *_), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
         left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
         if np.count_nonzero(shown) > LISTED_LABELS:
-            _write_numbers(left, view, numbers, colours, NUMBER_RADIUS_SHARE * width)
+            _write_numbers(left, view, numbers, colours, NUMBER_RADIUS_FRACTION * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
         right.add_collection(
             PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
@@ -384,7 +384,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
     for colour, (title, mesh) in zip(CURVE_COLOURS, meshes, strict=False):
-        share, edges = rho_histogram(mesh.points, mesh.cells)
+        fraction, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
         shape = rho(mesh.points, mesh.cells)
         n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # often too few for a bar to be seen
@@ -392,13 +392,13 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
             f"{title}: mean {shape.mean():.3f}, {n_bad} bad cells; errors (i) {errors.mean:.4f}, "
             f"(ii) {errors.harmonic_mean:.4f}, (iii) {errors.l2:.4g}, (iv) {errors.worst:.4f}"
         )
-        axes.stairs(share, edges, fill=True, alpha=0.35, color=colour)
-        axes.stairs(share, edges, color=colour, linewidth=1.6, label=label)
+        axes.stairs(fraction, edges, fill=True, alpha=0.35, color=colour)
+        axes.stairs(fraction, edges, color=colour, linewidth=1.6, label=label)
     n = meshes[0][1].ndim
     axes.axvline(1.0 / n, color="black", linewidth=0.8, linestyle=":")
     axes.set_xlim(0.0, 1.0 / n * 1.02)
     axes.set_xlabel(f"rho = inradius / circumradius (1/{n} for a regular cell)")
-    axes.set_ylabel("share of cells")
+    axes.set_ylabel("fraction of cells")
     figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # no bar can cross it there
     return figure
 

@@ -80,15 +80,15 @@ def run_summary(
             "E": last.E,
             "E_G_relative": last.E_G / first.E_G,
             "E_D_relative": last.E_D / first.E_D if first.E_D > 0.0 else None,
-            "E_D_share_of_variance": last.E_D / spread if spread > 0.0 else None,
-            "E_D_share_of_variance_initial": first.E_D / spread if spread > 0.0 else None,
+            "E_D_fraction_of_variance": last.E_D / spread if spread > 0.0 else None,
+            "E_D_fraction_of_variance_initial": first.E_D / spread if spread > 0.0 else None,
         },
         "quality_initial": shapes[0],
         "quality": shapes[1],
         "history": result.history,
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
-        "missed": dict(result.missed),
+        "violated": dict(result.violated),
     }
 
 

@@ -13,9 +13,9 @@ from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
-from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_SHARE, EdgeRatios
+from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
 
-CHANGED_SHARE = 0.2  # of a label's size: what cells have more or less is said in words
+CHANGED_FRACTION = 0.2  # of a label's size: what cells have more or less is said in words
 LARGE_SIZE = 1e4  # mm3 or mm2: of a label so large its tenths are not shown
 
 
@@ -82,7 +82,7 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
         is_there = not np.isnan(distances).any()  # both surfaces are, off the faces of the box
         shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one of them is not there", "")
         table.add_row(title, *shown)
-    table.add_row("pieces", str(mask.components), str(mask.mesh_components))
+    table.add_row("connected components", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
     return table
 
@@ -90,7 +90,8 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
 def sizes_in_words(edges: EdgeRatios) -> str:
     """How the edges of a mesh meet their targets, and why they do not, in one line."""
     return (
-        f"edges over their target size: {edges.mean:.2f} in the mean; {edges.below:.1%} under {SHORT_EDGE_SHARE:.2f}, "
+        f"edges over their target size: {edges.mean:.2f} in the mean; {edges.below:.1%} under "
+        f"{SHORT_EDGE_FRACTION:.2f}, "
         f"where the image asks for smaller cells; {edges.above:.1%} over {LONG_EDGE:.2f}"
     )
 
@@ -104,7 +105,7 @@ def label_table(
     """
     table = new_table(
         "label", "voxels", size_words(ndim), "cells", "larger by, %", "Dice", "Dice by volume", "distance, mm", "95 %",
-        "largest", "area ratio", "folded, %", "edges in > 2", "pieces of voxels", "of cells",
+        "largest", "area ratio", "folded, %", "edges in > 2", "components of voxels", "of cells",
     )  # fmt: skip
     for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
@@ -133,10 +134,10 @@ def label_differences(
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = row.components + cavities - surface.euler // 2
         parts, more = [], row.mesh_volume - row.volume
-        if abs(more) > CHANGED_SHARE * row.volume:
+        if abs(more) > CHANGED_FRACTION * row.volume:
             parts.append(f"{abs(more) / row.volume:.0%} of its size {'lost' if more < 0.0 else 'more'}")
         if row.components != row.mesh_components:
-            parts.append(f"{_number_of(row.components, 'piece')} of voxels, {row.mesh_components} of cells")
+            parts.append(f"{_number_of(row.components, 'component')} of voxels, {row.mesh_components} of cells")
         parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")
         parts += _surplus(of_cells - cavities, "cavity")
         if parts and row.n_cells:

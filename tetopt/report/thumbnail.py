@@ -31,7 +31,7 @@ from tetopt.system.files import check_suffix, save_bytes
 
 SIDE_PIXELS = 128  # of a view: a head is seen, a page has 500 of them
 SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would flicker in single samples
-MARGIN_SHARE = 0.08  # of the mesh's largest side, left around it on each side
+MARGIN_FRACTION = 0.08  # of the mesh's largest side, left around it on each side
 SLAB_COUNT = 20  # across the mesh, of which the fullest is where it is cut, if its middle is emptier than half of that
 PALETTE_COLOURS = 32  # greys and oranges, as the eye needs them: half of the bytes of 256
 EDGE_POINTS = 4.0  # width of edges times the root of how many cells are cut: however many, they tint the image alike
@@ -87,7 +87,7 @@ def thumbnail_png(
     """The bytes of `save_thumbnail`."""
     views = VIEW_AXES[image.ndim]
     low, high = mesh.points[np.unique(mesh.cells)].min(axis=0), mesh.points[np.unique(mesh.cells)].max(axis=0)
-    half = (0.5 + MARGIN_SHARE) * float((high - low).max())
+    half = (0.5 + MARGIN_FRACTION) * float((high - low).max())
     places = [(low + high) / 2.0] * len(views)
     if image.ndim == 3:
         places = [_at(place, axis, _fullest(mesh, axis)) for place, axis in zip(places, (2, 0), strict=True)]

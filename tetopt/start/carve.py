@@ -15,7 +15,8 @@ from tetopt.geometry.topology import components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-DROPPED_SHARE = 0.1  # of the largest connected component of cells in one of voxels: smaller ones beside it are dropped
+# of the largest connected component of cells in one of voxels: smaller ones beside it are dropped
+DROPPED_FRACTION = 0.1
 
 
 class Carved(NamedTuple):
@@ -41,7 +42,7 @@ def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = Fa
     home = _home(mesh, chosen, number, size, image, region)
     largest = np.zeros(home.max() + 1)
     np.maximum.at(largest, home, volume)
-    is_dropped = (home == 0) | (volume < DROPPED_SHARE * largest[home])
+    is_dropped = (home == 0) | (volume < DROPPED_FRACTION * largest[home])
     is_dropped[np.argmax(volume)] = False
     is_kept[chosen[is_dropped[number]]] = False
     return Carved(is_kept, int(is_dropped.sum()))
@@ -77,9 +78,9 @@ def _home(
     of_voxel, n_homes = scipy.ndimage.label(region.inside)
     index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
     at = of_voxel[tuple(np.clip(index, 0, np.array(image.shape) - 1).T)].astype(np.int64)
-    shares = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
-    shares = shares[:, 1:]  # a component that lies outside in part has its home inside
-    home = np.zeros(shares.shape[0], dtype=np.int64)
-    has_home = np.diff(shares.indptr) > 0
-    home[has_home] = np.asarray(shares.argmax(axis=1)).ravel()[has_home] + 1
+    fractions = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
+    fractions = fractions[:, 1:]  # a component that lies outside in part has its home inside
+    home = np.zeros(fractions.shape[0], dtype=np.int64)
+    has_home = np.diff(fractions.indptr) > 0
+    home[has_home] = np.asarray(fractions.argmax(axis=1)).ravel()[has_home] + 1
     return home

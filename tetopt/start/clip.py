@@ -17,8 +17,8 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 
-SNAP_SHARE = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
-TOUCH_SHARE = 0.15  # of an edge: a node as near to the surface counts as on it, even if it cannot be put there
+SNAP_FRACTION = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
+TOUCH_FRACTION = 0.15  # of an edge: a node as near to the surface counts as on it, even if it cannot be put there
 LEAST_FULLNESS = 0.2  # see `_fullness`: a cell has to keep as much when nodes are put on the surface
 LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
 SNAP_STEPS = 8  # Newton steps towards the surface
@@ -85,8 +85,8 @@ def _snapped(
     crosses = a * b < 0.0
     edge, part = edge[crosses], a[crosses] / (a[crosses] - b[crosses])
     is_close = np.zeros(len(level), dtype=bool)
-    is_close[edge[part < SNAP_SHARE, 0]] = True
-    is_close[edge[part > 1.0 - SNAP_SHARE, 1]] = True
+    is_close[edge[part < SNAP_FRACTION, 0]] = True
+    is_close[edge[part > 1.0 - SNAP_FRACTION, 1]] = True
     close = np.flatnonzero(is_close)
     there, is_there = onto_surface(index[close], image, region)
     # Where a node cannot get there on a short way, its edges are split instead.
@@ -94,7 +94,7 @@ def _snapped(
     np.minimum.at(length, edge.ravel(), np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2))
     way = np.zeros(len(level))
     way[close] = np.linalg.norm(there - index[close], axis=1) / length[close]
-    is_there &= way[close] < 2.0 * SNAP_SHARE
+    is_there &= way[close] < 2.0 * SNAP_FRACTION
     moved = index.copy()
     moved[close[is_there]] = there[is_there]
     way[close[~is_there]] = 0.0
@@ -109,8 +109,8 @@ def _snapped(
     # What is left very near to a crossing counts as on the surface; it gets there as soon as it moves.
     edge = edge[level[edge].prod(axis=1) < 0.0]
     a, b = np.abs(level[edge].T)
-    level[edge[a < TOUCH_SHARE * (a + b), 0]] = 0.0
-    level[edge[b < TOUCH_SHARE * (a + b), 1]] = 0.0
+    level[edge[a < TOUCH_FRACTION * (a + b), 0]] = 0.0
+    level[edge[b < TOUCH_FRACTION * (a + b), 1]] = 0.0
     return moved, level
 
 

@@ -44,7 +44,7 @@ from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, cha
 from tetopt.system.budget import check_memory
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
-ROOT_SHARES = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
+ROOT_FRACTIONS = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
 # By which part of the requested number of nodes an octree may miss it:
 BISECTION_MISS = 0.002  # so near, no other threshold is tried;
 TRIAL_MISS = 0.05  # so near, no other size of the undivided blocks is tried;
@@ -67,11 +67,11 @@ OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and hal
 MOST_BLOCKS = 2**24
 LAYER_BLOCKS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
 UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # the plastic number's powers -1 to -3
-SKIPPED_SHARE = 2.0  # of the requested nodes: with more leaves, nodes are not counted one by one
+SKIPPED_RATIO = 2.0  # of the requested nodes: with more leaves, nodes are not counted one by one
 NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
 TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
 TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
-FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
+FLAT_VOLUME_FRACTION = 1e-6  # of the mean volume: a cell with less is flat
 
 
 def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
@@ -184,7 +184,7 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
 
 
 def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
-    """How many nodes the targets take, 1.5 times those of equilateral cells; and the share of the mesh that has one.
+    """How many nodes the targets take, 1.5 times those of equilateral cells; and the fraction of the mesh that has one.
 
     Where there is one, there are 2^(n + 2) nodes or more, as few as any image is meshed with.
 
@@ -273,7 +273,7 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
         if cells is None:
             continue
         size = volumes(points, cells)
-        least = FLAT_VOLUME_SHARE * float(size.mean())
+        least = FLAT_VOLUME_FRACTION * float(size.mean())
         if size.min() <= least and image.ndim == 3:
             cells = without_flat(points, cells, least)
             size = volumes(points, cells)
@@ -390,8 +390,8 @@ def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
     """
     n = target.ndim
     more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
-    share = (_uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0) / TIE_SPREAD
-    return np.asarray(more > np.maximum((2**n - 1) * share, TARGET_SLACK))
+    fraction = (_uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0) / TIE_SPREAD
+    return np.asarray(more > np.maximum((2**n - 1) * fraction, TARGET_SLACK))
 
 
 def _uneven(*index: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -457,7 +457,7 @@ def _root_counts(image: Image, nodes: int, limits: _BlockLimits) -> Iterator[tup
     largest, smallest = limits.largest, limits.smallest
     lengths = image.spacing * image.shape
     kind = "bcc" if image.ndim == 3 else "criss-cross"
-    coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * share))) for share in ROOT_SHARES]
+    coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * fraction))) for fraction in ROOT_FRACTIONS]
     edges = [lengths / roots for roots in coarse]
     fit = [e.max() <= largest * (1.0 + 1e-9) and e.min() >= smallest for e in edges]
     if limits.target is not None and (widest := float(limits.target.max())) < NO_BOUND_MM:
@@ -490,7 +490,7 @@ def _division(
         # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number
         # that is counted, and it rises as the threshold falls.
         n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(int(np.count_nonzero(each)) for each in divided)
-        is_skipped = not regions and n_leaves > SKIPPED_SHARE * nodes
+        is_skipped = not regions and n_leaves > SKIPPED_RATIO * nodes
         count = NODES_OF_LEAF * n_leaves if is_skipped else len(_leaf_nodes(divided, roots, regions))
         if best_count < 0 or abs(count - nodes) < abs(best_count - nodes):
             best_count, best, is_bound = count, divided, is_skipped

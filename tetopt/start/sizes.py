@@ -16,7 +16,7 @@ from tetopt.system.kernel_cache import njit
 
 # A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set
 # (`docs/understand/sizes.md`).
-COARSEST_SHARE = 1.4
+COARSEST_RATIO = 1.4
 # By dimension, the shortest, the mean and the longest edge of the cells in a block over the block's own edge: from a
 # corner to the centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the
 # box's faces.
@@ -29,21 +29,21 @@ EQUILATERAL_NODES = {
     2: 2.0 / 3.0**0.5,
     3: 6.0 * 2.0**0.5 * (3.0 * np.arccos(1.0 / 3.0) - np.pi) / np.pi,
 }
-STAIRCASE_SHARE = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # a surface over its voxels' sides, over all directions
+STAIRCASE_RATIO = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # a surface over its voxels' sides, over all directions
 SIZED_OVER_EQUILATERAL = 1.5  # nodes that targets take: cells of an image are neither regular nor all of one size
 LONG_EDGE = 2.0**0.5  # over its target: a longer edge is split, as in MMG, since its halves are nearer to it
-SHORT_EDGE_SHARE = 0.5**0.5  # of its target: a shorter edge is one that the image has made
+SHORT_EDGE_FRACTION = 0.5**0.5  # of its target: a shorter edge is one that the image has made
 RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))  # edges over target: 1/8 to 4, four to a doubling
 NO_BOUND_MM = 1e30  # stands for infinity in float32, to which steps can still be added
-UNEVEN_SHARE = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
+UNEVEN_RATIO = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
 
 
 class Sizes(NamedTuple):
     """Targets and limits for the edges of cells where `octree_mesh` and the exchanges of `optimize` put nodes.
 
-    A target (`largest`, `field`) is for the usual edge: octrees begin near it, edges over sqrt 2 times it are split, as
-    far as there are nodes, and no collapse makes one. Where the image is worth it, cells are smaller. That takes up to
-    1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest` are bounds. Nodes move in
+    A target (`edge_size`, `field`) is for the usual edge: octrees begin near it, edges over sqrt 2 times it are split,
+    as far as there are nodes, and no collapse makes one. Where the image is worth it, cells are smaller. That takes up
+    to 1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest` are bounds. Nodes move in
     between, which makes some edges longer or shorter: in the tests one in a hundred is more than 5 % longer than the
     longest. `quality` tells the longest and the shortest.
 
@@ -52,8 +52,8 @@ class Sizes(NamedTuple):
     smallest : float
         No block and no split makes a shorter edge, mm, and no target is below it. Where not both can be, this is kept
         rather than `longest`. Nodes then move nearer: in one run a tenth of the edges ended shorter.
-    largest : float, optional
-        The largest target anywhere, mm; `inf` for none.
+    edge_size : float, optional
+        The target, mm, everywhere, and the largest where `field` has one; `inf` for none.
     gradation : float, optional
         How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
         1 / gradation blocks wide; 1, the default, to 0.05. Targets grow by no more than gradation x distance, and
@@ -61,12 +61,12 @@ class Sizes(NamedTuple):
         hardly two sizes it changes little.
     field : Image, optional
         The target, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
-        where it is 0 or below, only `largest` is one.
+        where it is 0 or below, only `edge_size` is one.
     coarsest : float, optional
-        Without `largest` and `longest`: the longest edge over that of a uniform mesh with as many nodes, by default
+        Without `edge_size` and `longest`: the longest edge over that of a uniform mesh with as many nodes, by default
         1.4.
     longest : float, optional
-        No block and no collapse makes a longer edge, mm. By default, without `largest`, `coarsest` times the longest
+        No block and no collapse makes a longer edge, mm. By default, without `edge_size`, `coarsest` times the longest
         edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
         better, but the displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of
         blocks on the box's faces.
@@ -79,13 +79,13 @@ class Sizes(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> sizes = tetopt.Sizes(largest=16.0)
+    >>> sizes = tetopt.Sizes(edge_size=16.0)
     >>> len(tetopt.mesh_image(image, sizes=sizes, iterations=4).mesh.points)
     227
     """
 
     smallest: float = 0.0
-    largest: float | None = None
+    edge_size: float | None = None
     gradation: float | None = None
     field: Image | None = None
     coarsest: float | None = None
@@ -99,7 +99,7 @@ class Sizes(NamedTuple):
     @property
     def has_target(self) -> bool:
         """Whether there is a target anywhere."""
-        return self.field is not None or (self.largest is not None and self.largest < np.inf)
+        return self.field is not None or (self.edge_size is not None and self.edge_size < np.inf)
 
     def prepared(self, n: int) -> Sizes:
         """The same sizes, checked; the field's steps are lowered to the gradation.
@@ -130,7 +130,7 @@ class Sizes(NamedTuple):
         """
         if not 0.0 <= self.smallest < np.inf:
             raise InputError(f"smallest: expected 0 mm or more, got {self.smallest}")
-        for name, value in (("largest", self.largest), ("longest", self.longest)):
+        for name, value in (("edge_size", self.edge_size), ("longest", self.longest)):
             if value is not None and not value > 0.0:
                 raise InputError(f"{name}: expected a length above 0 mm, got {value}")
             if value is not None and value < self.smallest:
@@ -158,7 +158,7 @@ class Sizes(NamedTuple):
         Returns
         -------
         float
-            mm; `inf` where there is a largest target.
+            mm; `inf` where there is a target everywhere.
 
         Examples
         --------
@@ -169,14 +169,14 @@ class Sizes(NamedTuple):
         """
         if self.longest is not None:
             return self.longest
-        if self.largest is not None:
+        if self.edge_size is not None:
             return np.inf
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         if volume is not None:  # nodes of a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
-        coarsest = COARSEST_SHARE if self.coarsest is None else self.coarsest
+        coarsest = COARSEST_RATIO if self.coarsest is None else self.coarsest
         return LONGEST_IN_BLOCK[image.ndim] * max(coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim])
 
     def on_voxels(self, image: Image) -> NDArray[np.float32]:
@@ -195,11 +195,11 @@ class Sizes(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> targets = tetopt.Sizes(largest=12.0).on_voxels(image)
+        >>> targets = tetopt.Sizes(edge_size=12.0).on_voxels(image)
         >>> targets.shape, float(targets.max())
         ((16, 16, 16), 12.0)
         """
-        largest = np.float32(NO_BOUND_MM if self.largest is None else np.clip(self.largest, 1e-30, NO_BOUND_MM))
+        largest = np.float32(NO_BOUND_MM if self.edge_size is None else np.clip(self.edge_size, 1e-30, NO_BOUND_MM))
         smallest = np.float32(self.smallest)
         if self.field is None:
             return np.broadcast_to(np.maximum(largest, smallest), image.shape)
@@ -226,11 +226,11 @@ class Sizes(NamedTuple):
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
         >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)  # fine in the ball
-        >>> sizes = tetopt.Sizes(largest=20.0, field=field)
+        >>> sizes = tetopt.Sizes(edge_size=20.0, field=field)
         >>> sizes.at(np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 30.0]])).tolist()
         [6.0, 20.0]
         """
-        target = np.full(len(points), np.inf if self.largest is None else self.largest)
+        target = np.full(len(points), np.inf if self.edge_size is None else self.edge_size)
         if self.field is not None:
             index, (low, high) = self.field.to_index(points), box_sides(self.field.shape).T
             is_in_field = ((index >= low - ON_SIDE_VOXELS) & (index <= high + ON_SIDE_VOXELS)).all(axis=1)
@@ -298,14 +298,14 @@ class Sizes(NamedTuple):
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
         >>> mesh = tetopt.lattice_mesh(image, nodes=300)
-        >>> sizes, own = tetopt.Sizes(largest=12.0), np.full(len(mesh.points), 16.0)
+        >>> sizes, own = tetopt.Sizes(edge_size=12.0), np.full(len(mesh.points), 16.0)
         >>> target = sizes.around(mesh.points, mesh.cells)
         >>> longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, target)
         >>> bool((longest <= 1.5 * 12.0).all())
         True
         """
         bound = np.minimum(self.longest_edge(image, nodes, volume), LONG_EDGE * target)
-        return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.slope))
+        return np.minimum(bound, UNEVEN_RATIO * _around(own, points, cells, self.slope))
 
 
 def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None) -> float:
@@ -328,7 +328,7 @@ def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] |
         if inside is not None:
             whole = np.moveaxis(inside, axis, 0)
             steps = of_voxel[1:][whole[1:] & ~whole[:-1]].sum() + of_voxel[:-1][whole[:-1] & ~whole[1:]].sum()
-            nodes += STAIRCASE_SHARE[n] * float(steps)
+            nodes += STAIRCASE_RATIO[n] * float(steps)
     return nodes
 
 
@@ -336,10 +336,10 @@ class EdgeRatios(NamedTuple):
     """Edges over their targets, each edge once; those of which both ends have one."""
 
     mean: float
-    above: float  # share of edges over sqrt 2 times their target: there were no nodes to split them
-    below: float  # share of edges under 1 / sqrt 2 times their target: the image has made them so
+    above: float  # fraction of edges over sqrt 2 times their target: there were no nodes to split them
+    below: float  # fraction of edges under 1 / sqrt 2 times their target: the image has made them so
     edges_of_bins: tuple[float, ...]  # edge over target, B + 1, rising; the first and last bins hold what is beyond
-    share: list[float]  # (B,) of the edges in each bin
+    fraction: list[float]  # (B,) of the edges in each bin
 
 
 def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | None:
@@ -354,7 +354,7 @@ def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | N
     if len(ratio) == 0:
         return None
     counts = np.histogram(np.clip(ratio, RATIO_BINS[0], RATIO_BINS[-1]), RATIO_BINS)[0]
-    above, below = float((ratio > LONG_EDGE).mean()), float((ratio < SHORT_EDGE_SHARE).mean())
+    above, below = float((ratio > LONG_EDGE).mean()), float((ratio < SHORT_EDGE_FRACTION).mean())
     return EdgeRatios(float(ratio.mean()), above, below, RATIO_BINS, (counts / len(ratio)).tolist())
 
 

@@ -40,7 +40,7 @@ from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.fields import cell_fields
-from tetopt.model.laws import Law
+from tetopt.model.mappings import ModulusMapping
 from tetopt.report.summary import image_summary, versions
 from tetopt.study.child import run_in_child
 from tetopt.study.compare_report import (
@@ -90,11 +90,11 @@ class Comparison(NamedTuple):
 
     image: Image
     labels: Image | None  # for tetopt's own pipelines besides the image, and for those that segment
-    law: Law  # from intensity to kPa
+    mapping: ModulusMapping  # from intensity to kPa
     settings: Settings
     image_source: ImageSource
     label_source: LabelSource | None
-    law_words: str
+    mapping_words: str
     command: str
 
 
@@ -122,7 +122,7 @@ class Bench(NamedTuple):
     facts: Facts
 
 
-def default_law(image: Image) -> tuple[Law, str]:
+def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
     """A modulus from any image: 1 to 10 kPa between its 0.5th and 99.5th percentile, and the words for it."""
     low, high = (float(p) for p in np.percentile(image.data, [0.5, 99.5]))
     if high <= low:
@@ -131,18 +131,18 @@ def default_law(image: Image) -> tuple[Law, str]:
     return [(low, 1.0), (high, 10.0)], words
 
 
-def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say) -> Standard:
+def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Settings, say: Say) -> Standard:
     """The reference solutions, which take a while.
 
     Raises
     ------
     InputError
-        As `tetopt.model.laws.young_from` and `tetopt.fem.reference.reference`.
+        As `tetopt.model.mappings.young_from` and `tetopt.fem.reference.reference`.
     """
-    fine = young_image(image, law)
+    fine = young_image(image, mapping)
     dofs = settings.reference_dofs
     if dofs is None:
-        dofs = reference_dofs(image, law, settings, say)
+        dofs = reference_dofs(image, mapping, settings, say)
     modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
@@ -159,9 +159,9 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
     )
 
 
-def reference_dofs(image: Image, law: Law, settings: Settings, say: Say) -> int:
+def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings, say: Say) -> int:
     """Size of the reference that `reference_seconds` and the memory allow; another one in every run, by a little."""
-    budget = affordable_dofs(young_image(image, law), settings.nus, settings.reference_seconds, settings.percent)
+    budget = affordable_dofs(young_image(image, mapping), settings.nus, settings.reference_seconds, settings.percent)
     limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
     say(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
     return budget.dofs
@@ -175,7 +175,7 @@ def _settled(comparison: Comparison, facts: Facts, runs: Path, say: Say, *, resu
         before = _read_back(path) if resume else None
         dofs = None if before is None or before[0] != choice else before[1]
         if dofs is None:
-            dofs = reference_dofs(comparison.image, comparison.law, settings, say)
+            dofs = reference_dofs(comparison.image, comparison.mapping, settings, say)
             _write_down(path, [choice, dofs])
         comparison = comparison._replace(settings=settings._replace(reference_dofs=dofs))
     return comparison
@@ -217,7 +217,7 @@ def measured(
     owner = cell_of_voxel(image, mesh)
     total = image_summary(image)["total_variation"]
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
-    share, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
+    fraction, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
     angles, angle_edges = np.histogram(dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0))
     try:
         check_fills_box(image, mesh)
@@ -231,11 +231,11 @@ def measured(
         n_corners=len(mesh.points),
         n_cells=len(mesh.cells),
         E_D=E_D,
-        E_D_share=E_D / total if total > 0.0 else None,
+        E_D_fraction=E_D / total if total > 0.0 else None,
         n_missed_voxels=int((owner < 0).sum()),
         n_empty_cells=int((moments.n_voxels == 0).sum()),
         quality=quality(mesh.points, mesh.cells),
-        rho_histogram=Histogram(edges.tolist(), share.tolist()),
+        rho_histogram=Histogram(edges.tolist(), fraction.tolist()),
         dihedral_histogram=Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=_label_rows(standard, mesh, of_cell, moments.mean, owner),
         fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
@@ -250,7 +250,7 @@ def _label_rows(
     means: NDArray[np.float64],
     owner: NDArray[np.int64],
 ) -> list[LabelRow]:
-    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, the voxels of its cells, E_D's share."""
+    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, the voxels of its cells, E_D's fraction."""
     of_voxels = cell_labels(standard.labels, mesh)
     of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
     label = standard.labels.data.ravel().astype(np.int64)
@@ -262,7 +262,7 @@ def _label_rows(
     return [
         LabelRow(
             label=row.label, voxels=row.voxels, mesh_voxels=int(painted[row.label]), dice=row.dice,
-            E_D_share=float(squares[row.label]) / total if total > 0.0 else None, is_lost=row.is_lost,
+            E_D_fraction=float(squares[row.label]) / total if total > 0.0 else None, is_lost=row.is_lost,
             volume_mm3=row.volume, mesh_volume_mm3=row.mesh_volume,
             surface_mean_mm=row.distance_mean, surface_p95_mm=row.distance_p95,
             components=row.components, mesh_components=row.mesh_components,
@@ -343,7 +343,7 @@ def _run(
     facts = _facts(comparison)
     comparison = _settled(comparison, facts, runs, say, resume=resume)
     image, settings = comparison.image, comparison.settings
-    standard = prepared(image, classes, comparison.law, settings, say)
+    standard = prepared(image, classes, comparison.mapping, settings, say)
     pipelines = pipelines_with(settings.programs)
     bench = Bench(comparison, standard, pipelines, runs, say, resume, facts)
     results: dict[int, list[PipelineResult]] = {1: [], 2: []}
@@ -368,7 +368,7 @@ def _run(
             comparison.image_source, image.shape, image.spacing.tolist(), float(np.var(image.data, dtype=np.float64))
         ),
         labels=comparison.label_source,
-        law=comparison.law_words,
+        mapping=comparison.mapping_words,
         versions=versions() | _peers() | _programs(settings),
         machine=_machine(),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
@@ -431,9 +431,9 @@ def _programs(settings: Settings) -> dict[str, str]:
 
 
 def _facts(comparison: Comparison) -> Facts:
-    """Image, labels, moduli and versions: not the law's words, which may be the name of a file that has changed."""
+    """Image, labels, moduli and versions: not the mapping's words, which may be the name of a file that has changed."""
     source = comparison.label_source
-    modulus = young_image(comparison.image, comparison.law).data
+    modulus = young_image(comparison.image, comparison.mapping).data
     facts = {
         "image": as_json(comparison.image_source),
         "labels": as_json(source and source._replace(names={})),
@@ -514,8 +514,8 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
     done = PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
     _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
-    share = "none" if measurement.E_D_share is None else f"{measurement.E_D_share:.4f}"
-    bench.say(f"{title}: {measurement.n_nodes} nodes, E_D share {share}, {total:.0f} s")
+    fraction = "none" if measurement.E_D_fraction is None else f"{measurement.E_D_fraction:.4f}"
+    bench.say(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
     # Read back, so that a kept run and a new one are the same: what is not finite is None in both.
     return from_json(Attempt, _read_back(path))
 
@@ -563,7 +563,7 @@ def _curve(bench: Bench, result: PipelineResult, order: int) -> Curve:
         else:
             result.notes.append(f"at {nodes} nodes: {attempt.failure}")
     points = [
-        CurvePoint(each.n_nodes, each.E_D_share, each.fem)
+        CurvePoint(each.n_nodes, each.E_D_fraction, each.fem)
         for each in sorted((run.measurement for run in runs), key=lambda each: each.n_nodes)
     ]
     return Curve(result.name, result.title, order, points)

@@ -19,7 +19,7 @@ COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.refe
 )
 MEBI_BYTES = 1e-6  # megabytes in a byte
 FULL_DIGITS = (1e4, 1e9)  # from which a number is printed without a fraction, and below which in full
-EQUAL_SHARE = 0.005  # of a value: one that differs by less is no different, and three digits do not show it
+EQUAL_FRACTION = 0.005  # of a value: one that differs by less is no different, and three digits do not show it
 
 
 class Criterion(NamedTuple):
@@ -51,7 +51,7 @@ def criteria(report: Report) -> list[Criterion]:
     """The rows of all tables, in order."""
     ratios = fem_ratios(report)
     return [
-        Criterion("Image", "Image", "E_D, share of the image's variance", _at("E_D_share"), -1, is_headline=True,
+        Criterion("Image", "Image", "E_D, fraction of the image's variance", _at("E_D_fraction"), -1, is_headline=True,
             blind="where the error lies, and whether it matters there: noise within a cell counts like an edge"),
         Criterion("Image", "Image", "voxels outside the mesh", _at("n_missed_voxels"), -1, is_detail=True),
         *_label_criteria(report),
@@ -140,7 +140,7 @@ def _label_criteria(report: Report) -> list[Criterion]:
         ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1, ""),
         ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1, ""),
         ("of these, where two labels meet", over(sum, attrgetter("nonmanifold_edges_two_labels")), -1, ""),
-        ("labels in more or fewer pieces", over(sum, lambda row: row.mesh_components != row.components), -1, ""),
+        ("labels with more or fewer components", over(sum, lambda row: row.mesh_components != row.components), -1, ""),
     ]  # fmt: skip
     part = f"Labels {which_labels(report)}"
     return [
@@ -177,7 +177,7 @@ def voxels_by_label(report: Report) -> dict[int, int]:
 
 
 def volume_error(row: LabelRow) -> float | None:
-    """Of a label in the mesh, as a share of its volume in the image."""
+    """Of a label in the mesh, as a fraction of its volume in the image."""
     return row.mesh_volume_mm3 / row.volume_mm3 - 1.0 if row.volume_mm3 else None
 
 
@@ -296,5 +296,5 @@ def loss_text(value: float | None, best: float) -> str:
     if best > 0.0 and value > 0.0:
         ratio = value / best
         far = abs(ratio - 1.0)
-        return f"{ratio_text(ratio)} the best" if far > EQUAL_SHARE else f"within {max(far, 1e-4):.1%} of the best"
+        return f"{ratio_text(ratio)} the best" if far > EQUAL_FRACTION else f"within {max(far, 1e-4):.1%} of the best"
     return f"{number_text(abs(value - best))} from the best"

@@ -109,20 +109,20 @@ def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.floa
 
 
 def histograms_figure(report: Report) -> Figure:
-    """Shares of cells by rho (left) and of dihedral angles (right), the pipelines' median runs over each other."""
+    """Fractions of cells by rho (left) and of dihedral angles (right), the pipelines' median runs over each other."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     panels = figure.subplots(1, 2)
     names = (
-        ("rho_histogram", "rho = inradius / circumradius (1/3 for a regular cell)", "share of cells"),
-        ("dihedral_histogram", "dihedral angle, degrees (70.5 in a regular cell)", "share of angles"),
+        ("rho_histogram", "rho = inradius / circumradius (1/3 for a regular cell)", "fraction of cells"),
+        ("dihedral_histogram", "dihedral angle, degrees (70.5 in a regular cell)", "fraction of angles"),
     )
     for axes, (name, across, up) in zip(panels, names, strict=True):
         for number, pipeline, run in _finished(report):
-            edges, share = getattr(run.measurement, name)
+            edges, fraction = getattr(run.measurement, name)
             style = _style(number)
             if pipeline.kind == "tetopt":
-                axes.stairs(share, edges, fill=True, alpha=0.18, color=style["color"])
-            axes.stairs(share, edges, label=pipeline.title, linewidth=1.8, **style)
+                axes.stairs(fraction, edges, fill=True, alpha=0.18, color=style["color"])
+            axes.stairs(fraction, edges, label=pipeline.title, linewidth=1.8, **style)
         axes.set_xlabel(across)
         axes.set_ylabel(up)
         axes.set_ylim(bottom=0.0)
@@ -173,7 +173,7 @@ def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
     """Errors by number of nodes, or by the seconds of a solve: a row for each Poisson's ratio, a column for each error.
 
     Logarithmic, with the average of moduli that is set; lines of quadratic cells are solid, of linear ones broken.
-    Without any finite-element result: E_D as a share of the image's variance by the number of nodes instead.
+    Without any finite-element result: E_D as a fraction of the image's variance by the number of nodes instead.
     """
     ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.fem}, key=float)
     rows = max(len(ratios), 1)
@@ -186,8 +186,8 @@ def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
             axes.set_title(f"{title}, ν = {nu}", fontsize=11)
         grid[row, 0].set_ylabel("relative error")
     if not ratios:
-        _draw_curves(grid[0, 0], report, lambda point: (point.n_nodes, point.E_D_share))
-        grid[0, 0].set_ylabel("E_D, share of the image's variance")
+        _draw_curves(grid[0, 0], report, lambda point: (point.n_nodes, point.E_D_fraction))
+        grid[0, 0].set_ylabel("E_D, fraction of the image's variance")
     for axes in grid[-1]:
         axes.set_xlabel("seconds of the processor, matrix and solve" if is_by_time and ratios else "nodes in all")
     _legend(figure, grid.ravel())
@@ -237,7 +237,7 @@ def _draw_curves(axes: Axes, report: Report, place: Callable[[CurvePoint], Place
 
 
 def tradeoff_figure(report: Report) -> Figure:
-    """What each option of a graded mesh trades: E_D's share against mean rho, angles and, where simulated, errors.
+    """What each option of a graded mesh trades: E_D's fraction against mean rho, angles and, where simulated, errors.
 
     A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
     """
@@ -266,7 +266,7 @@ def tradeoff_figure(report: Report) -> Figure:
             axes.set_ylim(bottom=0.0)
         axes.set_title(title, fontsize=10)
         axes.set_xscale("log")
-        axes.set_xlabel("E_D, share of the image's variance")
+        axes.set_xlabel("E_D, fraction of the image's variance")
         low, high = axes.get_xlim()
         if high < SHORT_RANGE * low:
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
@@ -289,22 +289,22 @@ def _draw_tradeoff(axes: Axes, report: Report, order: int, value: Value, is_open
     options = list(dict.fromkeys(row.option for row in of_order))
     for number, option in enumerate(options):
         rows = [row for row in of_order if row.option == option]
-        points = [(row.measured.E_D_share, value(row.measured)) for row in rows]
+        points = [(row.measured.E_D_fraction, value(row.measured)) for row in rows]
         style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
         axes.plot(*zip(*points, strict=True), marker=LINE_MARKERS[number], markersize=5, linewidth=1.2, **style)
         for row, point in zip(rows, points, strict=True):
             if not (is_open or row.is_default):
                 _annotate(axes, f"{row.value:.3g}", point, (4, 3), style["color"])
     default = next(row.measured for row in of_order if row.is_default)
-    place: tuple[Any, Any] = (default.E_D_share, value(default))
+    place: tuple[Any, Any] = (default.E_D_fraction, value(default))
     axes.plot(
         *place, marker="*", markersize=15, color="black", linestyle="none", zorder=5,
         markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
     )  # fmt: skip
     for pipeline in report.pipelines if order == 1 else report.quadratic:
         run = pipeline.median
-        if pipeline.kind != "tetopt" and run is not None and run.measurement.E_D_share:
-            place = (run.measurement.E_D_share, value(run.measurement))
+        if pipeline.kind != "tetopt" and run is not None and run.measurement.E_D_fraction:
+            place = (run.measurement.E_D_fraction, value(run.measurement))
             if place[1] is None:  # not compressed
                 continue
             axes.plot(*place, marker="x", color="#666666", markersize=6, zorder=4)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from tetopt.study.compare_criteria import (
-    EQUAL_SHARE,
+    EQUAL_FRACTION,
     GROUPS,
     Criterion,
     CriterionEntry,
@@ -41,7 +41,7 @@ class Claim(NamedTuple):
     other_title: str
     other_kind: str  # "peer", "control", or "tetopt" for another of its own meshes
     ratio: float | None  # tetopt's over the other's; None where one is 0 or missing
-    verdict: Verdict  # on tetopt; "no different" within the runs' ranges, or by less than `EQUAL_SHARE`
+    verdict: Verdict  # on tetopt; "no different" within the runs' ranges, or by less than `EQUAL_FRACTION`
     beside: list[str]  # what a reader must know with it: why there is no verdict, the reference's own change, nodes
     own_change: float | None  # of the reference from its half resolution; None if not known, and for other measures
     blind: str  # what the measure does not see
@@ -170,7 +170,7 @@ def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verd
     low, high = own.low, own.high
     if row.is_timed and low == high and other.value > 0.0:  # of one run: it scatters like the other's, at the least
         low, high = (own.value * each / other.value for each in (other.low, other.high))
-    is_near = abs(own.value - other.value) <= EQUAL_SHARE * max(abs(own.value), abs(other.value))
+    is_near = abs(own.value - other.value) <= EQUAL_FRACTION * max(abs(own.value), abs(other.value))
     best = winners(row.better, [own.value, other.value])
     if is_near or len(best) != 1 or (low <= other.high and other.low <= high):
         return "no different"
@@ -214,7 +214,7 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
         runs = ", ".join(f"{report.pipelines[place].title} {len(report.pipelines[place].runs)}" for place in places)
         remarks.append(
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges counts as none, "
-            f"nor does one below {EQUAL_SHARE:.1%}; of one run no range is known. An error has no "
+            f"nor does one below {EQUAL_FRACTION:.1%}; of one run no range is known. An error has no "
             "verdict where the meshes differ by less than the reference does from its own half resolution, nor have "
             "time and memory of one run each."
         )

@@ -30,11 +30,11 @@ class LabelMedians(NamedTuple):
     dice: float | None
     surface_mean: float | None  # mm
     surface_p95: float | None  # mm
-    volume_error: float | None  # share of the volume in the image
-    pieces: float | None
-    E_D_share: float | None
+    volume_error: float | None  # fraction of the volume in the image
+    mesh_components: float | None
+    E_D_fraction: float | None
     area_ratio: float | None  # of its surface over that of its voxels smoothed
-    folded: float | None  # share of its edges folded sharper than 60 degrees
+    folded: float | None  # fraction of its edges folded sharper than 60 degrees
     n_lost: int  # runs in which nothing carries it
     n_runs: int
 
@@ -46,11 +46,11 @@ def _label_medians(pipeline: PipelineResult, label: int) -> LabelMedians:
         values = [number for row in rows if (number := value(row)) is not None]
         return float(np.median(values)) if values else None
 
-    names = ("dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_share", "area_ratio", "folded")
-    dice, mean, p95, pieces, share, area, folded = (median(attrgetter(name)) for name in names)
+    names = ("dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_fraction", "area_ratio", "folded")
+    dice, mean, p95, mesh_components, fraction, area, folded = (median(attrgetter(name)) for name in names)
     n_lost = sum(row.is_lost for row in rows)
     return LabelMedians(
-        dice, mean, p95, median(volume_error), pieces, share, area, folded, n_lost, len(rows)
+        dice, mean, p95, median(volume_error), mesh_components, fraction, area, folded, n_lost, len(rows)
     )  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
         f"{origin} Each cell counts for the label that its mesher gives it, or else most of its voxels carry. In the "
         "table, for each label and mesh: Dice; mean and 95th percentile of the distance between the label's surfaces "
         "in mesh and image, both ways; error of its volume; area of its surface over that of its voxels smoothed "
-        "(vtkSurfaceNets3D), and share of its edges folded sharper than 60°. Labels on which "
+        "(vtkSurfaceNets3D), and fraction of its edges folded sharper than 60°. Labels on which "
         f"{done[first].title} has the lowest Dice come first."
     )
     heads = {label: _label_words(report, label) for label in voxels}
@@ -79,13 +79,15 @@ def labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
         rest = _label_table_html(done, medians, voxels, {label: heads[label] for label in folded})
         words.append(folded_html(f"The other {len(folded)} labels", rest))
     components = {row.label: row.components for each in done for run in each.runs for row in run.measurement.labels}
-    pieces = [["label", "in the image", *(pipeline.title for pipeline in done)]]
-    shares = [["label", "voxels", *(pipeline.title for pipeline in done)]]
+    mesh_components = [["label", "in the image", *(pipeline.title for pipeline in done)]]
+    fractions = [["label", "voxels", *(pipeline.title for pipeline in done)]]
     for label, rows in medians.items():
-        pieces.append([heads[label], str(components[label]), *(number_text(each.pieces) for each in rows)])
-        shares.append([heads[label], str(voxels[label]), *(number_text(each.E_D_share) for each in rows)])
-    words.append(folded_html("Connected pieces of each label", table_html(pieces)))
-    words.append(folded_html("E_D in each label, share of the image's variance", table_html(shares)))
+        mesh_components.append(
+            [heads[label], str(components[label]), *(number_text(each.mesh_components) for each in rows)]
+        )
+        fractions.append([heads[label], str(voxels[label]), *(number_text(each.E_D_fraction) for each in rows)])
+    words.append(folded_html("Connected components of each label", table_html(mesh_components)))
+    words.append(folded_html("E_D in each label, fraction of the image's variance", table_html(fractions)))
     return words
 
 

@@ -304,7 +304,7 @@ def _origin_html(report: Report) -> list[str]:
             ["image's variance", number_text(image.variance)],
             ["labels", f"{labels.name} ({labels.kind})" if labels else "none given: classes of the intensities"],
             *([["labels' SHA-256", labels.sha256]] if labels else []),
-            ["modulus", report.law],
+            ["modulus", report.mapping],
             ["reference", _reference_text(report.reference)],
             ["machine", ", ".join(f"{key} {_text(value)}" for key, value in report.machine.items())],
             ["date", report.date],

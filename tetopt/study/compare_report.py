@@ -64,10 +64,10 @@ class LabelSource(NamedTuple):
 
 
 class Histogram(NamedTuple):
-    """Shares between edges."""
+    """Fractions between edges."""
 
-    edges: list[float]  # one more than shares
-    share: list[float]
+    edges: list[float]  # one more than fractions
+    fraction: list[float]
 
 
 class LabelRow(NamedTuple):
@@ -80,7 +80,7 @@ class LabelRow(NamedTuple):
     voxels: int
     mesh_voxels: int
     dice: float
-    E_D_share: float | None  # the label's part of E_D, over the image's variance; None in an image without any
+    E_D_fraction: float | None  # the label's part of E_D, over the image's variance; None in an image without any
     is_lost: bool
     volume_mm3: float
     mesh_volume_mm3: float
@@ -119,7 +119,7 @@ class Measurement(NamedTuple):
     n_corners: int  # the mesh's own
     n_cells: int
     E_D: float
-    E_D_share: float | None  # of the image's variance; None in an image without any
+    E_D_fraction: float | None  # of the image's variance; None in an image without any
     n_missed_voxels: int
     n_empty_cells: int
     quality: Quality
@@ -182,7 +182,7 @@ class CurvePoint(NamedTuple):
     """Errors at one number of nodes."""
 
     n_nodes: int  # in all
-    E_D_share: float | None
+    E_D_fraction: float | None
     fem: dict[str, Simulation]  # by nu
 
 
@@ -227,7 +227,7 @@ class Report(NamedTuple):
     command: str
     image: ImageFacts
     labels: LabelSource | None
-    law: str
+    mapping: str
     versions: dict[str, str]
     machine: dict[str, int | str | None]  # cores, load, processor and system
     date: str  # on which the comparison ended, UTC

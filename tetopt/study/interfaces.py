@@ -22,7 +22,7 @@ from tetopt.image import Image
 OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
 SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
 SPECK_AREA = 3.0  # pieces of surface with less than this many size^2 are dropped: no cell of that size shows them
-EDGE_SHARE = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
+EDGE_FRACTION = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
 SINC_ITERATIONS = 30  # of the smoothing; VTK's default is 20, and a narrower pass band takes more
 PASS_BAND = 0.05  # of the same; VTK's default is 0.1, and less is smoother
 PAD_VOXELS = 4  # by which the volume is continued, so that neither smoothing nor decimation frays at the box's faces
@@ -182,7 +182,7 @@ def _smoothed(surface: pyvista.PolyData) -> pyvista.PolyData:
 
 
 def _decimated(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
-    n_triangles = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE_SHARE * size) ** 2)
+    n_triangles = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE_FRACTION * size) ** 2)
     reduction = 1.0 - max(n_triangles, 4.0) / surface.n_cells
     bare = pyvista.PolyData.from_regular_faces(surface.points, surface.regular_faces)
     return bare.decimate(reduction, volume_preservation=True) if reduction > 0.0 else bare

@@ -27,7 +27,7 @@ from tetopt.io.images import cropped, image_slice
 from tetopt.measure.quality import QualityErrors, quality_errors
 from tetopt.mesh import Mesh
 from tetopt.model.averages import cell_young
-from tetopt.model.laws import Law
+from tetopt.model.mappings import ModulusMapping
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.phantom import load_phantom
 from tetopt.start.delaunay import delaunay
@@ -286,12 +286,18 @@ class Simulated(NamedTuple):
 
 
 def simulate(
-    image: Image, mesh: Mesh, nu: float = DEFAULT_NU, percent: float = 1.0, law: Law = None, average: str = "mean"
+    image: Image,
+    mesh: Mesh,
+    nu: float = DEFAULT_NU,
+    percent: float = 1.0,
+    mapping: ModulusMapping = None,
+    average: str = "mean",
 ) -> tuple[Simulated, Compression]:
     """Top fixed, bottom pushed in by `percent` of the height along the faces' normal, both bonded.
 
-    `law` takes intensities to kPa (see `tetopt.model.laws.young_from`); None: the image is the modulus. `average`
-    makes one of those of a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq. (2).
+    `mapping` takes intensities to kPa (see `tetopt.model.mappings.young_from`); None: the image is the modulus.
+    `average` makes one of those of a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq.
+    (2).
 
     Raises
     ------
@@ -301,7 +307,7 @@ def simulate(
     """
     bottom, top = box_faces(image, mesh)
     check_fills_box(image, mesh)
-    young = cell_young(image, mesh, law, average)
+    young = cell_young(image, mesh, mapping, average)
     push = push_of(image, percent)
     pressed = compression(mesh, young, nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
     system = conditioning(pressed.system)

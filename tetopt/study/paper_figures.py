@@ -34,11 +34,11 @@ def relaxation_figure(case: Case) -> Figure:
     movement.tick_params(axis="y", labelcolor=AFTER_COLOUR)
     panels[2].set_title("(c) energy; movement in orange", fontsize=10)
     for mesh, colour in ((initial, BEFORE_COLOUR), (final, AFTER_COLOUR)):
-        share, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
-        panels[3].stairs(share, edges, fill=True, alpha=0.35, color=colour)
-        panels[3].stairs(share, edges, color=colour)
+        fraction, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
+        panels[3].stairs(fraction, edges, fill=True, alpha=0.35, color=colour)
+        panels[3].stairs(fraction, edges, color=colour)
     panels[3].set_xlabel("rho")
-    panels[3].set_title("(d) share of cells, initial grey", fontsize=10)
+    panels[3].set_title("(d) fraction of cells, initial grey", fontsize=10)
     return figure
 
 

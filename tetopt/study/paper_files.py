@@ -148,7 +148,7 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
         "Row 3 of Table 1 is set by the mesh alone and comes out to the printed digits. The phantom's shapes and the "
         "number of iterations are not printed; ours are fig2_2d and 20. With k_D = 0.3 (iii) and (iv) come out higher "
         f"than printed because of the two worst triangles, at the rim of our disc: {flat.sum():.2f} of the sum (iii) "
-        "is theirs; the paper's mode has no floor on shape."
+        "is theirs; the paper's mode has no bound on shape."
     )
     return {
         "text": text, "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
@@ -260,12 +260,12 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
             ("optimised", segment(volume, case.result.mesh, classes)),
         )
     }
-    share = volume.data.size / len(case.initial.cells)
+    ratio = volume.data.size / len(case.initial.cells)
     text = (
         "Section 5 proposes an optimised mesh as a fast approximate segmentation and prints no numbers. Cells are "
         "grouped by their means into K classes and painted back to the voxels; each class stands for the tissue that "
         "most of its voxels carry, and a tissue for which no class stands has Dice 0. Beside it the same classes from "
-        f"the voxels themselves, which have {share:.0f} times as many values. The mesh has {len(case.initial.points)} "
+        f"the voxels themselves, which have {ratio:.0f} times as many values. The mesh has {len(case.initial.points)} "
         "nodes. Labels of the MNI152: 0 background, 1 CSF, 2 grey, 3 white matter. Tissue thinner than a cell, as the "
         "CSF round the brain, is out of reach."
     )

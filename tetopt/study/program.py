@@ -78,8 +78,8 @@ def parse_program(text: str) -> Program:
     except ValueError as error:
         raise InputError(f"{where}: its quotes do not match ({error}): {command}") from error
     used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
-    if strange := sorted(used - set(PLACEHOLDERS)):
-        raise InputError(f"{where}: expected placeholders of {_braced(PLACEHOLDERS)}, got {{{strange[0]}}}")
+    if unknown := sorted(used - set(PLACEHOLDERS)):
+        raise InputError(f"{where}: expected placeholders of {_braced(PLACEHOLDERS)}, got {{{unknown[0]}}}")
     if "output" not in used or not used & {"image", "labels"}:
         raise InputError(f"{where}: expected {{output}}, and {{image}} or {{labels}} or both, got: {command}")
     for word in words:

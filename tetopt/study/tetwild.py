@@ -1,7 +1,7 @@
 """fTetWild (Hu, Schneider, Wang, Zorin, Panozzo 2020) through pytetwild, on the soup of interfaces and box.
 
 One factor scales the sizing field and, with its 8th power, the envelope: where the interfaces alone need more nodes
-than there are, only a wider envelope helps. How the choices were made, E_D as a share of the image's variance:
+than there are, only a wider envelope helps. How the choices were made, E_D as a fraction of the image's variance:
 
 - MNI T1, 4 classes, 5000 nodes. With an envelope of 1.35 mm, edges of 13, 25 and 49 mm give 16,755, 15,951 and 15,635
   nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); as it is now (3.2 mm,
@@ -39,7 +39,7 @@ from tetopt.system.extras import install_hint
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
 # Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.
 TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)
-ENVELOPE_SHARE = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
+ENVELOPE_FRACTION = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
 ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, which end at small factors, are met closely
 EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces
 EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
@@ -97,7 +97,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
     spacing = node_spacing(image, corners_for(nodes, order))
 
     def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        envelope = ENVELOPE_SHARE * spacing * factor**ENVELOPE_EXPONENT
+        envelope = ENVELOPE_FRACTION * spacing * factor**ENVELOPE_EXPONENT
         return _run(tetrahedralize, surfaces, factor * spacing, envelope)
 
     runs = tries(run, lambda made: node_count(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tetopt.engine.loop import GRADED_K_D, QUADRATIC_GRADATION, QUADRATIC_SHARE, SHAPE_POWER
+from tetopt.engine.loop import GRADED_K_D, QUADRATIC_GRADATION, QUADRATIC_RATIO, SHAPE_POWER
 from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.sizes import COARSEST_SHARE, Sizes
+from tetopt.start.sizes import COARSEST_RATIO, Sizes
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
 
 # An option, its defaults and values around them by the order of the cells, and what `mesh_image` gets for a value.
@@ -21,8 +21,8 @@ SWEPT_OPTIONS: tuple[SweptOption, ...] = (
      lambda value: {"shape_power": value}),
     ("gradation", {1: 1.0, 2: QUADRATIC_GRADATION}, {1: (0.2, 0.5, 1.0), 2: (0.2, QUADRATIC_GRADATION, 0.9)},
      lambda value: {"sizes": Sizes(gradation=value)}),
-    ("largest edge, of a uniform mesh's", {1: COARSEST_SHARE, 2: QUADRATIC_SHARE},
-     {1: (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0), 2: (0.9, 1.0, QUADRATIC_SHARE, 1.3, 1.6)},
+    ("largest edge, of a uniform mesh's", {1: COARSEST_RATIO, 2: QUADRATIC_RATIO},
+     {1: (1.0, 1.15, COARSEST_RATIO, 2.0, 3.0), 2: (0.9, 1.0, QUADRATIC_RATIO, 1.3, 1.6)},
      lambda value: {"sizes": Sizes(coarsest=value)}),
     ("uniform, k_D", dict.fromkeys((1, 2)), dict.fromkeys((1, 2), (0.0, 0.2, 0.5, 0.8)),
      lambda value: {"mode": "uniform", "k_D": value}),

@@ -1,6 +1,6 @@
 """Other processes of Python, by which kernels are compiled, files read, pipelines run and tasks worked on.
 
-None of them imports modules of the current folder, which may be a stranger's as much as its files: neither those that
+None of them imports modules of the current folder, which may be as untrusted as its files: neither those that
 are started here, nor what they start, nor those of libraries.
 """
 

@@ -419,12 +419,12 @@ def _run_plain(task: Unit, n: int, values: Any) -> int:
     n_threads, loop = numba.get_num_threads(), task.loop
     step = max(1, n // (PIECES_PER_THREAD * n_threads))
 
-    def share(thread: int) -> int:
+    def fraction(thread: int) -> int:
         record = cast(values, task.signature.args[0], task.__name__, thread)
         return sum(loop(record, first, min(first + step, n)) for first in range(thread * step, n, n_threads * step))
 
     with ThreadPoolExecutor(n_threads) as threads:
-        return sum(threads.map(share, range(n_threads)))
+        return sum(threads.map(fraction, range(n_threads)))
 
 
 def run(task: Any, n: int, values: Any) -> None:

@@ -1,4 +1,4 @@
-"""Laws from intensity to modulus: of arrays, in words, in files."""
+"""Mappings from intensity to modulus: of arrays, in words, in files."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from models import sample_model
 
 from tetopt import InputError
 from tetopt.model.build import build_model
-from tetopt.model.laws import ByLabel, has_column, load_law, parse_any_law, parse_law, young_from
+from tetopt.model.mappings import ByLabel, has_column, load_mapping, parse_any_mapping, parse_mapping, young_from
 
 TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
 
@@ -18,7 +18,7 @@ def test_a_table_is_linear_between_its_pairs_and_constant_beyond_them():
     np.testing.assert_array_equal(young_from([(7.0, 3.0)], [-1.0, 7.0, 8.0]), [3.0, 3.0, 3.0])
 
 
-def test_no_law_takes_the_intensity_itself_and_a_copy_of_it():
+def test_no_mapping_takes_the_intensity_itself_and_a_copy_of_it():
     intensities = np.array([0.0, 1.5, 7.0])
     moduli = young_from(None, intensities)
     np.testing.assert_array_equal(moduli, intensities)
@@ -29,11 +29,11 @@ def test_no_law_takes_the_intensity_itself_and_a_copy_of_it():
 def test_a_function_sees_float64_and_may_return_whole_numbers():
     seen = []
 
-    def law(h):
+    def mapping(h):
         seen.append(h.dtype)
         return np.full(h.shape, 3)
 
-    moduli = young_from(law, np.array([1, 2], dtype=np.uint8))
+    moduli = young_from(mapping, np.array([1, 2], dtype=np.uint8))
     assert seen == [np.float64]
     assert moduli.dtype == np.float64
     np.testing.assert_array_equal(moduli, [3.0, 3.0])
@@ -50,46 +50,46 @@ def test_a_function_equal_to_a_table_gives_the_same():
 
 
 @pytest.mark.parametrize(
-    ("law", "message"),
+    ("mapping", "message"),
     [
         (
             [(0, 1), (0, 2)],
-            "law: intensities must increase, got 0 and then 0; sort the pairs and give each intensity once",
+            "mapping: intensities must increase, got 0 and then 0; sort the pairs and give each intensity once",
         ),
         (
             [(0, 1), (9, 2), (5, 3)],
-            "law: intensities must increase, got 9 and then 5; sort the pairs and give each intensity once",
+            "mapping: intensities must increase, got 9 and then 5; sort the pairs and give each intensity once",
         ),
-        ([], "law: expected pairs (intensity, kPa), got an array of shape (0,)"),
-        ([1.0, 2.0], "law: expected pairs (intensity, kPa), got an array of shape (2,)"),
-        ([(1, 2, 3)], "law: expected pairs (intensity, kPa), got an array of shape (1, 3)"),
-        ("soft", "law: expected pairs (intensity, kPa), got 'soft'"),
-        ([(0, 1), (1,)], "law: expected pairs (intensity, kPa), got [(0, 1), (1,)]"),
-        ([(0, 1), (5, np.nan)], "law: every intensity and modulus must be finite, got [[0.0, 1.0], [5.0, nan]]"),
+        ([], "mapping: expected pairs (intensity, kPa), got an array of shape (0,)"),
+        ([1.0, 2.0], "mapping: expected pairs (intensity, kPa), got an array of shape (2,)"),
+        ([(1, 2, 3)], "mapping: expected pairs (intensity, kPa), got an array of shape (1, 3)"),
+        ("soft", "mapping: expected pairs (intensity, kPa), got 'soft'"),
+        ([(0, 1), (1,)], "mapping: expected pairs (intensity, kPa), got [(0, 1), (1,)]"),
+        ([(0, 1), (5, np.nan)], "mapping: every intensity and modulus must be finite, got [[0.0, 1.0], [5.0, nan]]"),
         (
             [(0, -1), (10, 9)],
             "modulus: expected 0 kPa or more, got 1 others, such as -1 at intensity 0; "
-            "give a law (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
             lambda h: 4.0 - h,
             "modulus: expected 0 kPa or more, got 2 others, such as -1 at intensity 5, -6 at intensity 10; "
-            "give a law (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
             lambda h: np.where(h > 5, np.inf, 1.0),
             "modulus: expected 0 kPa or more, got 1 others, such as inf at intensity 10; "
-            "give a law (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
             lambda h: h.sum(),
-            "law: expected a function that returns one value for each intensity, got shape () for shape (3,)",
+            "mapping: expected a function that returns one value for each intensity, got shape () for shape (3,)",
         ),
     ],
 )
-def test_messages_of_laws(law, message):
+def test_messages_of_mappings(mapping, message):
     with pytest.raises(InputError) as error:
-        young_from(law, [0, 5, 10])
+        young_from(mapping, [0, 5, 10])
     assert str(error.value) == message
 
 
@@ -99,12 +99,12 @@ def test_messages_of_laws(law, message):
 @pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1,a=2", "1.5=2", "1=x", "*=1,*=2"])
 def test_labels_that_are_none(text):
     with pytest.raises(InputError, match="by label"):
-        parse_any_law(text)
+        parse_any_mapping(text)
 
 
-def test_a_law_of_the_intensity_alone():
+def test_a_mapping_of_the_intensity_alone():
     with pytest.raises(InputError, match="expected one of the intensity"):
-        parse_law("1=2")
+        parse_mapping("1=2")
 
 
 TOML = "intensity = [0, 50, 200]\nyoung = [0.5, 1, 6.0]\nnu = [0.45, 0.4, 0.49]\n"
@@ -115,20 +115,20 @@ CSV = "intensity, young, nu\n0,0.5,0.45\n50,1,0.4\n200,6.0,0.49\n"
 def test_tables_from_files(tmp_path, name, text):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
-    assert parse_any_law(str(path)) == [(0.0, 0.5), (50.0, 1.0), (200.0, 6.0)]
-    assert load_law(path, "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
+    assert parse_any_mapping(str(path)) == [(0.0, 0.5), (50.0, 1.0), (200.0, 6.0)]
+    assert load_mapping(path, "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
 
 
 def test_labels_from_a_file(tmp_path):
     (tmp_path / "a.csv").write_text("label,young\n3,2.5\n0,1\n")
-    assert load_law(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
+    assert load_mapping(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
     for head in ("name", "label"):
         (tmp_path / "n.csv").write_text(f"{head},young\nleft lung,2.5\n7,1\n*,3\n")
-        assert load_law(tmp_path / "n.csv") == ByLabel({"left lung": 2.5, 7: 1.0}, 3.0)
+        assert load_mapping(tmp_path / "n.csv") == ByLabel({"left lung": 2.5, 7: 1.0}, 3.0)
     (tmp_path / "n.toml").write_text('name = ["liver", "*"]\nyoung = [5, 20]\n')
-    assert load_law(tmp_path / "n.toml") == ByLabel({"liver": 5.0}, 20.0)
+    assert load_mapping(tmp_path / "n.toml") == ByLabel({"liver": 5.0}, 20.0)
     (tmp_path / "b.csv").write_text("Label,Young,Nu\n3,2.5,0.3\n*,1,0.45\n")
-    assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
+    assert load_mapping(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
     assert has_column(str(tmp_path / "b.csv"), "nu")
     assert not has_column(str(tmp_path / "a.csv"), "nu")
     table = build_model(
@@ -171,29 +171,29 @@ def test_labels_from_a_file(tmp_path):
 def test_files_that_are_none(tmp_path, name, text, match):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=match) as caught:
-        load_law(tmp_path / name)
+        load_mapping(tmp_path / name)
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="no such file"):
-        load_law(tmp_path / "no.csv")
+        load_mapping(tmp_path / "no.csv")
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_separators_of_csv(tmp_path, separator):
     (tmp_path / "a.csv").write_text(CSV.replace(",", separator))
-    assert load_law(tmp_path / "a.csv", "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
+    assert load_mapping(tmp_path / "a.csv", "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
 
 
 def test_csv_of_another_encoding(tmp_path):
     (tmp_path / "a.csv").write_bytes("name,young\nMäuse,2\n".encode("latin-1"))
     with pytest.raises(InputError, match=r'expected text in UTF-8, .* in Excel as "CSV UTF-8"'):
-        load_law(tmp_path / "a.csv")
+        load_mapping(tmp_path / "a.csv")
 
 
 def test_a_table_must_increase():
     with pytest.raises(InputError, match="must increase, got 5 and then 3"):
-        parse_any_law("5:1,3:2")
+        parse_any_mapping("5:1,3:2")
 
 
 def test_other_names_than_h():
     with pytest.raises(InputError, match='cannot use "x"'):
-        parse_any_law("1 + x")
+        parse_any_mapping("1 + x")

@@ -1,4 +1,4 @@
-"""Laws: from an intensity, or a label, to a value such as Young's modulus; in words, in files, of arrays."""
+"""Modulus mappings: from an intensity or a label to a value such as Young's modulus; in words, files, arrays."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tetopt.errors import InputError
 from tetopt.model.formula import parse_formula
 from tetopt.system.incoming import text_of, toml_of
 
-LAW_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a law
-LAW_SUFFIXES = (".toml", ".csv")  # of files that a law's text may name
+MAPPED_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a mapping
+MAPPING_SUFFIXES = (".toml", ".csv")  # of files that a mapping's text may name
 
-Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
+ModulusMapping = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
 
 
 class ByLabel(NamedTuple):
-    """A value for each label instead of a law of the intensity.
+    """A value for each label instead of a mapping of the intensity.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class ByLabel(NamedTuple):
     rest: float | None = None
 
 
-def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
-    """What a law makes of each intensity, float64 of the same shape.
+def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
+    """The value of each intensity by a mapping, float64 of the same shape.
 
     Parameters
     ----------
-    law : callable, (K, 2) table or None
+    mapping : callable, (K, 2) table or None
         A function of a float64 array; or pairs (intensity, value), the intensities strictly increasing, between
         which the value is linear and beyond which it keeps the last pair's; or None: the intensity itself.
     intensities : array of real numbers
@@ -63,27 +63,27 @@ def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
         A table that is not of that kind, or a function that returns another shape.
     """
     intensities = np.asarray(intensities, dtype=np.float64)
-    if law is None:
+    if mapping is None:
         return intensities.copy()
-    if not callable(law):
-        table = _checked_table(law)
+    if not callable(mapping):
+        table = _checked_table(mapping)
         return np.interp(intensities, table[:, 0], table[:, 1])
-    values = np.asarray(law(intensities), dtype=np.float64)
+    values = np.asarray(mapping(intensities), dtype=np.float64)
     if values.shape != intensities.shape:
         raise InputError(
-            f"law: expected a function that returns one value for each intensity, got shape {values.shape} "
+            f"mapping: expected a function that returns one value for each intensity, got shape {values.shape} "
             f"for shape {intensities.shape}"
         )
     return values
 
 
-def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
-    """Young's modulus of each intensity, float64 of the same shape, kPa: `law_values`, none of them negative.
+def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
+    """Young's modulus of each intensity, float64 of the same shape, kPa: `mapped_values`, none of them negative.
 
     Raises
     ------
     InputError
-        As `law_values`, or a modulus that is negative or not finite. A modulus of 0 is let through, as empty space
+        As `mapped_values`, or a modulus that is negative or not finite. A modulus of 0 is let through, as empty space
         inside a cell; a cell of nothing else is refused when the stiffness matrix is built.
 
     Examples
@@ -92,7 +92,7 @@ def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
     array([1., 3., 5., 5.])
     """
     intensities = np.asarray(intensities, dtype=np.float64)
-    young = law_values(law, intensities)
+    young = mapped_values(mapping, intensities)
     is_bad = ~(np.isfinite(young) & (young >= 0.0))
     if is_bad.any():
         at, first_of = np.unique(intensities[is_bad], return_index=True)
@@ -100,7 +100,7 @@ def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} others, such as {first}; "
-            "give a law (`young`) that is positive over the image's range"
+            "give a modulus mapping (`young`) that is positive over the image's range"
         )
     return young
 
@@ -123,7 +123,7 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     except ValueError:
         pairs = []
     if not pairs or any(len(pair) != 2 for pair in pairs):
-        raise InputError(f'law: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"')
+        raise InputError(f'mapping: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"')
     return [(pair[0], pair[1]) for pair in pairs]
 
 
@@ -178,38 +178,38 @@ def _label_of(text: str) -> int | str:
     return int(text)
 
 
-def parse_law(text: str) -> Law:
-    """A law of the intensity from a command line, see `parse_any_law`.
+def parse_mapping(text: str) -> ModulusMapping:
+    """A mapping of the intensity from a command line, see `parse_any_mapping`.
 
     Raises
     ------
     InputError
-        As `parse_any_law`, and for values by label.
+        As `parse_any_mapping`, and for values by label.
     """
-    law = parse_any_law(text)
-    if isinstance(law, ByLabel):
-        raise InputError(f'law: expected one of the intensity, got values by label, "{text}"')
-    return parse_formula(text) if isinstance(law, float) else law
+    mapping = parse_any_mapping(text)
+    if isinstance(mapping, ByLabel):
+        raise InputError(f'mapping: expected one of the intensity, got values by label, "{text}"')
+    return parse_formula(text) if isinstance(mapping, float) else mapping
 
 
-def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
-    """A law from a command line.
+def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | ByLabel | float:
+    """A mapping from a command line.
 
     Parameters
     ----------
     text : str
         A number; a table of intensities, "0:1,100:5.5"; values by label or name, "1=2.1,liver=1.9,*=0.5"; a formula of
-        h (`parse_formula`); or a file named .toml or .csv (`load_law`).
+        h (`parse_formula`); or a file named .toml or .csv (`load_mapping`).
     quantity : str
         The file's column.
 
     Raises
     ------
     InputError
-        As `parse_table`, `parse_labels`, `parse_formula` and `load_law`.
+        As `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
     """
-    if (file := law_file(text)) is not None:
-        return load_law(file, quantity)
+    if (file := mapping_file(text)) is not None:
+        return load_mapping(file, quantity)
     if "=" in text:
         return parse_labels(text)
     with contextlib.suppress(ValueError):
@@ -218,13 +218,13 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
     return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
 
 
-def law_file(text: str) -> Path | None:
-    """The file that a law's text names; None if the text is the law."""
-    return Path(text) if text.lower().endswith(LAW_SUFFIXES) else None
+def mapping_file(text: str) -> Path | None:
+    """The file that a mapping's text names; None if the text is the mapping."""
+    return Path(text) if text.lower().endswith(MAPPING_SUFFIXES) else None
 
 
-def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
-    """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
+def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabel:
+    """A mapping from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
 
     Between the columns of CSV are commas, semicolons or tabs.
 
@@ -269,14 +269,14 @@ def _number(value: Any) -> float:
 
 
 def has_column(text: str, name: str) -> bool:
-    """Whether a law's text names a file that has such a column.
+    """Whether a mapping's text names a file that has such a column.
 
     Raises
     ------
     InputError
-        As `load_law`, of files.
+        As `load_mapping`, of files.
     """
-    if (file := law_file(text)) is None:
+    if (file := mapping_file(text)) is None:
         return False
     try:
         return name in _columns(file)
@@ -325,21 +325,21 @@ def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     return young
 
 
-def _checked_table(law: ArrayLike) -> NDArray[np.float64]:
+def _checked_table(mapping: ArrayLike) -> NDArray[np.float64]:
     """The (K, 2) table as float64; InputError unless finite and increasing."""
     try:
-        table = np.asarray(law, dtype=np.float64)
+        table = np.asarray(mapping, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"law: expected pairs (intensity, kPa), got {law!r}") from error
+        raise InputError(f"mapping: expected pairs (intensity, kPa), got {mapping!r}") from error
     if table.ndim != 2 or table.shape[1] != 2 or len(table) == 0:
-        raise InputError(f"law: expected pairs (intensity, kPa), got an array of shape {table.shape}")
+        raise InputError(f"mapping: expected pairs (intensity, kPa), got an array of shape {table.shape}")
     if not np.isfinite(table).all():
-        raise InputError(f"law: every intensity and modulus must be finite, got {table.tolist()}")
+        raise InputError(f"mapping: every intensity and modulus must be finite, got {table.tolist()}")
     falls = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
     if len(falls):
         k = int(falls[0])
         raise InputError(
-            f"law: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; "
+            f"mapping: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; "
             "sort the pairs and give each intensity once"
         )
     return table

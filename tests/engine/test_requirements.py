@@ -1,4 +1,4 @@
-"""A result says what its mesh should be and is not; each promise broken by hand, one at a time."""
+"""A result says which requirements its mesh violates; each is violated by hand, one at a time."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,15 @@ from shapes import shaped
 import tetopt
 from tetopt.check import manifold_problems
 from tetopt.contents.content import content, plain
-from tetopt.engine.promises import promised, requested
+from tetopt.engine.requirements import checked, requested
 
 
-def missed(target, result, min_dihedral=0.0, start=None):
-    return promised(result, plain(target), min_dihedral, result.mesh if start is None else start).missed
+def violated(target, result, min_dihedral=0.0, start=None):
+    return checked(result, plain(target), min_dihedral, result.mesh if start is None else start).violated
 
 
-def missed_request(image, result, target_error, is_filled):
-    return requested(result, plain(image), target_error, is_filled).missed
+def violated_request(image, result, target_error, is_filled):
+    return requested(result, plain(image), target_error, is_filled).violated
 
 
 @pytest.fixture(scope="module")
@@ -24,58 +24,60 @@ def whole():
     return image, tetopt.mesh_image(image, 300, iterations=2)
 
 
-def test_a_run_that_keeps_all_misses_nothing(whole):
-    assert whole[1].missed == {}
+def test_a_run_that_meets_all_violates_nothing(whole):
+    assert whole[1].violated == {}
 
 
-def test_the_floor(whole):
+def test_the_minimum_dihedral_angle(whole):
     image, result = whole
-    words = missed(image, result, 60.0)
-    assert list(words) == ["floor"]
+    words = violated(image, result, 60.0)
+    assert list(words) == ["min_dihedral"]
     angles = tetopt.geometry.simplex.dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
-    assert words["floor"].startswith(f"{(angles < 60.0).sum()} of {len(angles)} cells have an angle under 60 degrees")
+    assert words["min_dihedral"].startswith(
+        f"{(angles < 60.0).sum()} of {len(angles)} cells have an angle under 60 degrees"
+    )
     unmoved = result._replace(history=result.history[:1])
-    assert missed(image, unmoved, 60.0) == {}
+    assert violated(image, unmoved, 60.0) == {}
     # No mesh of tetrahedra has all angles so large: the run itself says so. Of few nodes, since it tries them all.
-    assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).missed) == ["floor"]
+    assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).violated) == ["min_dihedral"]
 
 
 def test_the_box_and_the_cover(whole):
     image, result = whole
     larger = result._replace(mesh=tetopt.Mesh(result.mesh.points * 1.01, result.mesh.cells))
-    assert list(missed(image, larger, start=result.mesh)) == ["box", "cover"]
-    assert list(missed(image, larger, start=larger.mesh)) == []  # as the user's own was
-    assert "0 voxels are outside" in missed_request(image, larger, None, True)["cover"]
+    assert list(violated(image, larger, start=result.mesh)) == ["box", "cover"]
+    assert list(violated(image, larger, start=larger.mesh)) == []  # as the user's own was
+    assert "0 voxels are outside" in violated_request(image, larger, None, True)["cover"]
     last = result.history[-1]
     fewer = result._replace(history=[*result.history, last._replace(n_voxels=last.n_voxels - 1)])
-    assert "-1 voxels" in missed(image, fewer)["cover"]
-    assert "1 voxels are outside" in missed_request(image, fewer, None, True)["cover"]
-    assert missed_request(image, fewer, None, False) == {}
+    assert "-1 voxels" in violated(image, fewer)["cover"]
+    assert "1 voxels are outside" in violated_request(image, fewer, None, True)["cover"]
+    assert violated_request(image, fewer, None, False) == {}
 
 
 def test_the_error(whole):
     image, result = whole
-    share = result.history[-1].E_D / (plain(image).variance * image.volume)
-    assert missed_request(image, result, 1.01 * share, True) == {}
-    assert list(missed_request(image, result, 0.99 * share, True)) == ["error"]
+    fraction = result.history[-1].E_D / (plain(image).variance * image.volume)
+    assert violated_request(image, result, 1.01 * fraction, True) == {}
+    assert list(violated_request(image, result, 0.99 * fraction, True)) == ["error"]
     short = tetopt.mesh_image(image, target_error=0.3, iterations=3, k_D=0.0)
-    assert ("error" in short.missed) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
+    assert ("error" in short.violated) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
 
 
 def test_a_mask_and_overlaps():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     result = tetopt.mesh_image(target, 400, iterations=3)
-    assert result.missed == {}
+    assert result.violated == {}
     last = result.history[-1]
     twice = result._replace(history=[last._replace(n_voxels=last.n_voxels + 2)])
-    assert "2 voxels twice" in missed(target, twice)["overlap"]
+    assert "2 voxels twice" in violated(target, twice)["overlap"]
     half = result.mesh.cells[: len(result.mesh.cells) // 2]
     used, cells = np.unique(half, return_inverse=True)
     part = tetopt.Mesh(result.mesh.points[used], cells.reshape(half.shape))
     n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
     halved = result._replace(mesh=part, history=[last._replace(n_voxels=n_voxels)])
-    assert set(missed(target, halved)) - {"components", "manifold"} == {"mask"}
+    assert set(violated(target, halved)) - {"components", "manifold"} == {"mask"}
 
 
 def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
@@ -91,29 +93,34 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
         part = tetopt.Mesh(result.mesh.points[used], rows.reshape(pair.shape))
         n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
         row = result.history[-1]._replace(n_voxels=n_voxels)
-        found = missed(target, result._replace(mesh=part, history=[row]))
+        found = violated(target, result._replace(mesh=part, history=[row]))
         assert sorted(set(found) - {"mask"}) == names
         assert "2 connected components, the mask 1" in found["components"]
 
 
 @pytest.mark.parametrize("name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"])
-def test_a_requirement_that_cannot_be_checked_is_missed_and_the_mesh_is_there(name, monkeypatch):
+def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(name, monkeypatch):
     def fail(*_):
         raise MemoryError
 
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     result = tetopt.mesh_image(target, 400, iterations=1)
-    monkeypatch.setattr(tetopt.engine.promises, name, fail)
-    names = {"dihedral_angles": "floor", "beyond_box": "box", "cell_of_voxel": "mask", "manifold_problems": "manifold"}
-    assert missed(target, result) == {names[name]: f"{names[name]} could not be checked: MemoryError"}
+    monkeypatch.setattr(tetopt.engine.requirements, name, fail)
+    names = {
+        "dihedral_angles": "min_dihedral",
+        "beyond_box": "box",
+        "cell_of_voxel": "mask",
+        "manifold_problems": "manifold",
+    }
+    assert violated(target, result) == {names[name]: f"{names[name]} could not be checked: MemoryError"}
 
 
 def test_an_interface_that_touches_itself():
     image, _ = shaped("ball")
     target = content(image, tetopt.Image(1.0 * (image.data > 50.0), image.affine))
     result = tetopt.mesh_image(target, 400, iterations=4)
-    assert result.missed == {}
+    assert result.violated == {}
     cells = result.mesh.cells
     node = int(np.bincount(cells.ravel()).argmax())
     star = np.flatnonzero((cells == node).any(axis=1))
@@ -121,7 +128,7 @@ def test_an_interface_that_touches_itself():
     one, other = np.argwhere(shared == 1)[0]  # two cells with the node alone in common
     labels = np.zeros_like(result.labels)
     labels[star[[one, other]]] = 1
-    words = missed(target, result._replace(labels=labels))
+    words = violated(target, result._replace(labels=labels))
     assert list(words) == ["manifold"]
     assert f"[[{node}]]" in words["manifold"]
 
@@ -133,12 +140,12 @@ def test_labels_without_cells():
     target = content(image, tetopt.Image(labels, image.affine))
     result = tetopt.mesh_image(target, 400, iterations=4)
     assert result.labels is not None
-    assert "labels" not in result.missed
+    assert "labels" not in result.violated
     none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
-    assert missed(target, none) == {
+    assert violated(target, none) == {
         "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
     }
-    assert missed(target, result._replace(labels=None)) == {}
+    assert violated(target, result._replace(labels=None)) == {}
 
 
 @pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
@@ -148,7 +155,7 @@ def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     result = tetopt.mesh_image(content(image, labels, mask), 300, **({"iterations": 4} | options))
     assert set(result.labels.tolist()) == {0, 1, 2}
     assert manifold_problems(result.mesh, result.labels) == []
-    assert not {"manifold", "labels"} & set(result.missed)
+    assert not {"manifold", "labels"} & set(result.violated)
 
 
 def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
@@ -156,12 +163,12 @@ def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
     start = tetopt.mesh_image(content(image, mask=mask), 300, iterations=1).mesh
     target = content(mask, mask, weights=[0.0])
     result = tetopt.mesh_image(target, start=start, iterations=1)
-    assert "labels" not in result.missed
+    assert "labels" not in result.violated
 
 
 def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
     image, _ = whole
-    assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).missed == {}
+    assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).violated == {}
     start = tetopt.mesh_image(image, 60, iterations=1).mesh
     kept = tetopt.mesh_image(image, start=start, iterations=1, min_dihedral=65.0)
-    assert list(kept.missed) == ["floor"]
+    assert list(kept.violated) == ["min_dihedral"]

@@ -174,7 +174,7 @@ def test_links_that_a_user_has_put_beside_a_mesh_stay_links(out):
         assert content(elsewhere) == before
 
 
-def test_strangers_that_come_during_a_run_do_not_keep_it_from_its_end(out):
+def test_foreign_files_that_come_during_a_run_do_not_keep_it_from_its_end(out):
     (out / ".work" / "thesis.txt").write_text("mine")
     (out / ".work" / "sub-01.run-1.7").mkdir()
     restore(out)

@@ -1,6 +1,6 @@
-"""What a mesh must keep, measured on the mesh itself, whatever the engine believes of it.
+"""The requirements of a mesh, measured on the mesh itself, whatever the engine believes of it.
 
-A run that ends in time returns a mesh even where it could not keep them all; its result says which it missed, and the
+A run that ends in time returns a mesh even where it could not meet them all; its result says which it violates, and the
 command line ends with 1 there.
 """
 
@@ -27,14 +27,14 @@ from tetopt.start.carve import n_components
 
 MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
 LABEL_VOXELS = 200  # a label of more may not be without cells
-ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may miss the floor that the kernels kept in ticks
+ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below that which the kernels kept in ticks
 VOLUME_ROUNDING = 1e-9  # relative: the volume of cells that fill the box exactly, summed up
 BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
 BOUNDARY_ROUNDING = 1e-6  # relative: likewise of cells within a boundary in the user's own digits
 
 
-def promised(result: MeshingResult, content: Content, min_dihedral: float, start: Mesh) -> MeshingResult:
-    """The result of a run with the promises that its mesh misses, each in a sentence.
+def checked(result: MeshingResult, content: Content, min_dihedral: float, start: Mesh) -> MeshingResult:
+    """The result of a run with the requirements that its mesh violates, each in a sentence.
 
     Parameters
     ----------
@@ -43,43 +43,43 @@ def promised(result: MeshingResult, content: Content, min_dihedral: float, start
     content : Content
         What the mesh represents.
     min_dihedral : float
-        The floor on dihedral angles, degrees; 0 for none, and in 2-D.
+        The minimum dihedral angle, degrees; 0 for none, and in 2-D.
     start : Mesh
         The mesh that the run began with, whose domain it should cover, if there is no mask.
 
     Returns
     -------
     MeshingResult
-        With `missed`, empty if there is nothing. `floor`: cells with an angle under the floor, of tetrahedra that were
-        moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or volume of
-        the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a Dice
-        with the mask below 0.9, and `components`: more connected components than the mask has. `manifold`: edges or
-        nodes at which the boundary, within a mask, or the interface of two labels is not a manifold. `labels`: labels
-        of more than 200 voxels that no cell has. A requirement that could not be checked, for want of memory, is
-        missed, too, with the reason: the mesh is not lost for it.
+        With `violated`, empty if there is nothing. `min_dihedral`: cells with a smaller dihedral angle, of tetrahedra
+        that were moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or
+        volume of the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a
+        Dice with the mask below 0.9, and `components`: more connected components than the mask has. `manifold`: edges
+        or nodes at which the boundary, within a mask, or the interface of two labels is not a manifold. `labels`:
+        labels of more than 200 voxels that no cell has. A requirement that could not be checked, for want of memory,
+        counts as violated, with the reason: the mesh is not lost for it.
     """
-    of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _missed_cover(result, start)}
+    of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
     if content.region is not None:
         of_domain = {
-            "mask": partial(_missed_mask, content.image, content.region, result),
-            "components": partial(_missed_components, content.region, result.mesh),
+            "mask": partial(_violated_mask, content.image, content.region, result),
+            "components": partial(_violated_components, content.region, result.mesh),
         }
     checks: dict[str, Callable[[], dict[str, str]]] = {
-        "floor": lambda: _missed_floor(result, min_dihedral),
+        "min_dihedral": lambda: _violated_min_dihedral(result, min_dihedral),
         "box": lambda: _beyond(result.mesh, start, content.image),
         **of_domain,
-        "manifold": lambda: _missed_manifold(content, result),
-        "labels": lambda: _missed_labels(content, result),
+        "manifold": lambda: _violated_manifold(content, result),
+        "labels": lambda: _violated_labels(content, result),
     }
-    missed: dict[str, str] = {}
+    violated: dict[str, str] = {}
     for name, check in checks.items():
         try:
-            missed |= check()
+            violated |= check()
         except InputError:
             raise
         except Exception as error:
-            missed[name] = f"{name} could not be checked: {type(error).__name__} {error}".rstrip()
-    return result._replace(missed=missed)
+            violated[name] = f"{name} could not be checked: {type(error).__name__} {error}".rstrip()
+    return result._replace(violated=violated)
 
 
 def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
@@ -88,43 +88,43 @@ def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
     return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed else {}
 
 
-def promised_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
-    """As `promised`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
-    missed = _missed_floor(result, min_dihedral) | _missed_box(grid, result)
+def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
+    """As `checked`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
+    violated = _violated_min_dihedral(result, min_dihedral) | _violated_box(grid, result)
     beyond = float(beyond_box(result.mesh, grid).max())
     if beyond > ON_SIDE_VOXELS:
-        missed["box"] = BEYOND_WORDS.format(beyond)
-    return result._replace(missed=missed)
+        violated["box"] = BEYOND_WORDS.format(beyond)
+    return result._replace(violated=violated)
 
 
-def _missed_floor(result: MeshingResult, min_dihedral: float) -> dict[str, str]:
+def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[str, str]:
     mesh = result.mesh
     if mesh.ndim != 3 or result.history[-1].iteration == 0:
         return {}
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
     words = f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to {angles.min():.2f}"
-    return {"floor": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
+    return {"min_dihedral": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
 
 
 def requested(result: MeshingResult, content: Content, target_error: float | None, is_filled: bool) -> MeshingResult:
-    """The result of a run with what it misses of what was asked of `mesh_image`, beside its promises.
+    """The result of a run with the requests to `mesh_image` that it does not meet, beside its requirements.
 
     `error`: more of the image's variance left in the cells than `target_error`. `cover`: if the mesh `is_filled`, which
     the image's box should be, voxels or volume of that.
     """
-    missed = dict(result.missed)
-    share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
-    if target_error is not None and share > target_error:
-        missed["error"] = (
-            f"{share:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
+    violated = dict(result.violated)
+    fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+    if target_error is not None and fraction > target_error:
+        violated["error"] = (
+            f"{fraction:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
             "cells or more iterations, or ask for a number of nodes"
         )
-    missed |= _missed_box(content.image, result) if is_filled else {}
-    return result._replace(missed=missed, share=share)
+    violated |= _violated_box(content.image, result) if is_filled else {}
+    return result._replace(violated=violated, fraction=fraction)
 
 
-def _missed_box(image: Image, result: MeshingResult) -> dict[str, str]:
+def _violated_box(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
@@ -132,7 +132,7 @@ def _missed_box(image: Image, result: MeshingResult) -> dict[str, str]:
     return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
 
 
-def _missed_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
+def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     before, volume = _volume(start), _volume(result.mesh)
     gained = result.history[-1].n_voxels - result.history[0].n_voxels
     if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
@@ -141,23 +141,23 @@ def _missed_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
-def _missed_mask(image: Image, region: Region, result: MeshingResult) -> dict[str, str]:
-    missed = {}
+def _violated_mask(image: Image, region: Region, result: MeshingResult) -> dict[str, str]:
+    violated = {}
     is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
-        missed["overlap"] = (
+        violated["overlap"] = (
             f"cells overlap: together they hold {twice} voxels twice; allow more nodes, and please report this"
         )
     dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
-        missed["mask"] = (
+        violated["mask"] = (
             f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
             "allow more nodes"
         )
-    return missed
+    return violated
 
 
-def _missed_components(region: Region, mesh: Mesh) -> dict[str, str]:
+def _violated_components(region: Region, mesh: Mesh) -> dict[str, str]:
     n_cells = np.sort(np.bincount(components(mesh.cells)))[::-1]
     if len(n_cells) == 1 or len(n_cells) <= (n_mask := n_components(region)):
         return {}
@@ -165,14 +165,14 @@ def _missed_components(region: Region, mesh: Mesh) -> dict[str, str]:
     return {"components": f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells; allow more nodes"}
 
 
-def _missed_manifold(content: Content, result: MeshingResult) -> dict[str, str]:
+def _violated_manifold(content: Content, result: MeshingResult) -> dict[str, str]:
     problems = [] if content.region is None else manifold_problems(result.mesh)
     if result.labels is not None and content.memberships is not None:
         problems += manifold_problems(result.mesh, result.labels)
     return {"manifold": "; ".join([*problems, "allow more nodes"])} if problems else {}
 
 
-def _missed_labels(content: Content, result: MeshingResult) -> dict[str, str]:
+def _violated_labels(content: Content, result: MeshingResult) -> dict[str, str]:
     members = content.memberships
     if members is None or result.labels is None:
         return {}

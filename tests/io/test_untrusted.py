@@ -1,4 +1,4 @@
-"""Files of strangers: whatever they hold, one line, in time, and nothing allocated that a header promises."""
+"""Untrusted files: whatever they hold, one line, in time, and nothing allocated that a header announces."""
 
 import gzip
 import os
@@ -23,7 +23,7 @@ from tetopt.io.meshes import load_mesh
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.model import parsed_bins
 from tetopt.model.labels import labels_named
-from tetopt.model.laws import load_law
+from tetopt.model.mappings import load_mapping
 from tetopt.phantom import load_phantom
 from tetopt.system import budget, incoming
 from tetopt.system.incoming import json_of, text_of, toml_of
@@ -125,7 +125,7 @@ def test_a_child_that_fails_is_one_line(some_file, monkeypatch, read, words):
 
 
 def test_modules_of_the_current_folder_are_not_run(tmp_path):
-    """A stranger's folder may hold a numpy.py: the child that reads must not take it for numpy."""
+    """An untrusted folder may hold a numpy.py: the child that reads must not take it for numpy."""
     (tmp_path / "a.vtu").write_bytes(b"x")
     for name in ("numpy", "json", "vtkmodules", "xml"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
@@ -435,7 +435,7 @@ def test_texts_are_bounded(tmp_path, monkeypatch):
 def test_toml_without_end(tmp_path, text, words):
     (tmp_path / "a.toml").write_text(text)
     refused(lambda path: toml_of(path, "table"), tmp_path / "a.toml", words)
-    for load in (load_phantom, load_law):
+    for load in (load_phantom, load_mapping):
         with pytest.raises(InputError) as caught:
             load(tmp_path / "a.toml")
         assert len(str(caught.value)) < 400
