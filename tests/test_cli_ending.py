@@ -181,7 +181,7 @@ def test_closed_descriptors_are_not_taken_by_files(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are of bytes on Linux alone")
-@pytest.mark.parametrize("suffix", ["vtu", "vtk", "xdmf", "msh", "msh2", "inp", "feb", "scn", "mfem", "mesh"])
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "xdmf", "msh", "msh2", "inp", "feb", "mfem", "mesh"])
 def test_names_that_are_not_utf_8(image, folder, suffix, capsys):
     name = os.fsdecode(b"caf\xe9\x1b[31m\n")
     os.rename(image, image.with_name(f"{name}.nii.gz"))
