@@ -24,7 +24,7 @@ def test_an_image_alone_is_itself():
     for target in (content(image), content([image]), plain(image), plain(content(image))):
         assert target.is_plain
         assert target.image is image
-        assert np.fractions_memory(target.values, image.data)
+        assert np.shares_memory(target.values, image.data)
         assert target.variance == pytest.approx(float(np.var(image.data, dtype=np.float64)), rel=1e-12)
         assert (target.n_voxels, target.volume) == (image.data.size, image.volume)
 
