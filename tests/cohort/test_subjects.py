@@ -34,7 +34,7 @@ def test_a_table_says_what_is_meshed(tmp_path):
 
 
 def test_files_of_mappings_are_relative_to_the_table(tmp_path):
-    path = table(tmp_path / "s.tsv", "subject\timage\tyoung\tnu\tdensity", "1\ta.nii\tlaw.csv\t0.3\t../rho.TOML")
+    path = table(tmp_path / "s.tsv", "subject\timage\tyoung\tnu\tdensity", "1\ta.nii\tmapping.csv\t0.3\t../rho.TOML")
     (row,) = read_table(path)
     mappings = {"young": str(tmp_path / "mapping.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
     assert row.options == mappings

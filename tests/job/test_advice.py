@@ -45,7 +45,7 @@ def said():
     ],
 )
 def test_a_mask_that_the_mesh_does_not_show(said, change, words):
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR._replace(**change)}) == []
+    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR._replace(**change)}) == {}
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
@@ -55,16 +55,18 @@ def test_what_background_leaves_is_no_mask(said):
     violated = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
     far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
     words = "the mesh and the foreground overlap only by Dice 0.5"
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, violated=violated), far, "foreground") == [words]
+    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, violated=violated), far, "foreground") == {
+        "mask": words
+    }
     text = said()
     assert "mask" not in text
     assert text.count("foreground") >= text.count("\n") == 5
 
 
 def test_components_that_were_dropped_are_told(said):
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 0}) == []
+    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 0}) == {}
     assert said() == ""
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 2}) == []
+    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 2}) == {}
     assert "dropped 2 connected components" in said()
 
 

@@ -32,7 +32,7 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
         if predict:
             return _predict(job, display)
         result = run(job, display, display.is_over)
-        display.close()
+        display.end_stage()
         _print(result)
         return signal_code() if is_ended() else int(bool(result.violated))
 
@@ -41,7 +41,7 @@ def _predict(job: Job, display: Display) -> int:
     """Say what the run will take."""
     with listened(display):
         task = read(job)
-        display.close()
+        display.end_stage()
     task.plan.division.chosen(print_prediction, print_parts)(task)
     return 0
 

@@ -32,22 +32,31 @@ class Display:
     def __init__(self, begin_keeping: Callable[[], None]) -> None:
         self._begin_keeping = begin_keeping
         self._shown = ExitStack()
+        self._violated: list[Event] = []  # said last of all, where they are seen
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
         self._n_rows = 0  # of the iterations so far; 0 while there are none
         self._say = rare_lines()
 
-    def close(self) -> None:
-        """End what is shown."""
+    def end_stage(self) -> None:
+        """End what is shown of a stage."""
         self._shown.close()
+
+    def close(self) -> None:
+        """End what is shown, and say which requirements are violated."""
+        self.end_stage()
+        while self._violated:
+            show_event(self._violated.pop(0))
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
         if event.kind == "started":
-            self.close()
+            self.end_stage()
             self._start(event.data, event.text)
         elif event.kind == "progress":
             self._tell(event)
+        elif event.kind == "violated":
+            self._violated.append(event)
         else:
             show_event(event)
 

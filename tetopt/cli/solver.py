@@ -97,7 +97,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
-        yield "the format runs no step: the loads are in the file as text"
+        yield "the format runs no step: its loads are text, if it has them"
     if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:

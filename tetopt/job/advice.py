@@ -30,17 +30,17 @@ EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for
 THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
 
-def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "mask") -> list[str]:
+def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "mask") -> dict[str, str]:
     """The requirements that the mesh does not meet (`tetopt.engine.requirements`), large labels without cells among
-    them.
+    them, by name.
 
     Each is told, and lesser deviations are warned of. Messages call what is meshed `word`.
     """
-    lost = list(_lost(measured))
-    of_result = [words for name, words in result.violated.items() if not (name == "labels" and lost)]
-    problems = [words.replace("the mask", f"the {word}") for words in (*of_result, *lost)]
-    for problem in problems:
-        violated(problem)
+    lost = dict(_lost(measured))
+    of_result = {name: words for name, words in result.violated.items() if name not in lost}
+    problems = {name: words.replace("the mask", f"the {word}") for name, words in (of_result | lost).items()}
+    for name, words in problems.items():
+        violated(words, name)
     _warn_of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
         warning(
@@ -50,17 +50,15 @@ def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "
     return problems
 
 
-def _lost(measured: dict[str, Any]) -> Iterator[str]:
+def _lost(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Labels of more than 200 voxels that no cell carries, by name; warns of lesser ones, and of those hardly shown."""
     labels = measured.get("labels", [])
     lost = [row for row in labels if row.is_lost]
     words = {row.label: label_words(row.label, measured.get("label_names", {})) for row in labels}
     large = [words[row.label] for row in lost if row.voxels > LABEL_VOXELS]
     if large:
-        yield (
-            f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels; allow more nodes, or a higher "
-            "`label_weight`"
-        )
+        words_of_large = f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels"
+        yield "labels", f"{words_of_large}; allow more nodes, or a higher `label_weight`"
     if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
         warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]

@@ -34,7 +34,8 @@ class Event(NamedTuple):
     text : str
         On one line. Arguments of the job stand between backticks: "`nodes`".
     data : object
-        Of "started" the `Stage`; of "progress" what that counts, such as an `IterationRecord`.
+        Of "started" the `Stage`; of "progress" what that counts, such as an `IterationRecord`; of "violated" the
+        requirement's name.
 
     Examples
     --------
@@ -96,6 +97,7 @@ def warning(text: str) -> None:
     _LISTENER.get()(Event("warning", text))
 
 
-def violated(text: str) -> None:
-    """Tell a requirement that the mesh does not meet."""
-    _LISTENER.get()(Event("violated", text))
+def violated(text: str, name: str | None = None) -> None:
+    """Tell what the mesh should be and is not; of a run's requirement with its name."""
+    words = text if name is None else f"requirement violated: {name}: {text}"
+    _LISTENER.get()(Event("violated", words, name))

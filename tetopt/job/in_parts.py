@@ -187,7 +187,7 @@ def run_in_parts(
         note(f"{counted(n_parts, 'part')} or more in a round, each of up to {memory_words(n_bytes)}")
         started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
-        started("parts")
+        started("parts", "optimising in parts")
         with _team(task.plan.job, folder, n_parts, n_bytes) as team:
 
             def run(names: Sequence[str]) -> Iterator[Any]:
@@ -195,18 +195,20 @@ def run_in_parts(
 
             yield run
 
-    started("parts")
+    started("parts", "optimising in parts")
     try:
         parted = mesh_in_parts(
             request, folder, source.content.statistics, volume=task.plan.left or source.contrasts[0],
             check=check, crew=crew, is_over=is_over,
-            watch=lambda now, history: progress("", PartsProgress(now, history)),
+            watch=lambda now, history: progress(
+                f"{now.done} of {counted(now.n_parts, 'part')} of a round", PartsProgress(now, history)
+            ),
         )  # fmt: skip
     except BaseException:  # Ctrl-C among them
         if task_bytes > 0.0 and (folder / STATE_NAME).exists():  # there were workers
             note(f"{folder} has what is done: run this again to go on, or remove it")
         raise
-    started("optimised")
+    started("optimised", "optimised")
     result = parted.result
     if result.ended == "stopped" and not stop():
         parted = parted._replace(result=result._replace(ended="max_seconds"))

@@ -69,7 +69,7 @@ class Judgement(NamedTuple):
         measured = self.measured
         if not self.is_checked:  # what makes the numbers above meaningless
             unmet, measured = {name: words for name, words in unmet.items() if name == "mask"}, {}
-        return wrong + tell_violated(self.result._replace(violated=unmet), measured, self.source.mask_word)
+        return [*wrong, *tell_violated(self.result._replace(violated=unmet), measured, self.source.mask_word).values()]
 
 
 def judge(

@@ -13,7 +13,7 @@ from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import MeshingResult
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import (
     ERROR_REACHED,
     ERROR_RUNS,
@@ -50,7 +50,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     seconds = task.plan.job.max_seconds
     ends = None if seconds is None else begin + seconds
     came = task.plan.division.chosen(_in_one_piece, _in_parts)(task, stop, begin, ends)
-    started("write")
+    started("write", "writing and measuring the mesh")
     return came
 
 
@@ -154,13 +154,16 @@ def watched(
     def is_stopped() -> bool:
         return stop() or (limit is not None and limit.is_reached())
 
-    result = run(max_seconds=max_seconds, callback=lambda row: progress("", row), stop=is_stopped)
+    def recorded(row: IterationRecord) -> None:
+        progress(f"iteration {row.iteration} of {iterations}: E {row.E:.4f}", row)
+
+    result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
     if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
         result = result._replace(mesh=initial)
     if result.ended == "stopped" and not stop():
         result = result._replace(ended="max_gb")
     if result.ended != "iterations":
-        started("optimised")
+        started("optimised", "optimised")
         words = ended_words(result.ended, "the mesh so far")
         note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result

@@ -35,9 +35,9 @@ class Result(NamedTuple):
         The mesh with its fields, sets, materials and loads.
     numbers : dict
         Every number of the run, as run.json has them.
-    violated : list of str
-        Requirements that the mesh does not meet, and what could not be measured, a sentence each; empty if it is all
-        that it should be.
+    violated : dict of str to str
+        By name, the requirements that the mesh does not meet, and what could not be measured, a sentence each; empty if
+        it is all that it should be.
     task : Task
         What was asked for, with all defaults, and the files as they were read.
     meshed : Meshed
@@ -58,7 +58,7 @@ class Result(NamedTuple):
     mesh: Mesh
     model: Model
     numbers: dict[str, Any]
-    violated: list[str]
+    violated: dict[str, str]
     task: Task
     meshed: Meshed
     shapes: Shapes
@@ -102,7 +102,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     >>> tetopt.save_image("ball.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
     >>> result = tetopt.run(tetopt.Job(images="ball.nii.gz", output="ball.vtu", nodes=300, iterations=4))
     >>> len(result.mesh.points), result.violated, result.numbers["ended"]
-    (300, [], 'iterations')
+    (300, {}, 'iterations')
     """
     begin = time.perf_counter()
     with listened(on):
@@ -120,7 +120,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
             save_json(job.json_path, numbers)
         if task.plan.pictures:
             draw(task, came, model)
-        result = Result(came.result.mesh, model, numbers, [], task, came, shapes, measured)
+        result = Result(came.result.mesh, model, numbers, {}, task, came, shapes, measured)
         result = result._replace(violated=_judged(result, failed))
         if came.is_kept:
             end_parts(job.output, came.result)
@@ -133,14 +133,14 @@ def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
     return shapes.get("quality_initial"), shapes.get("quality")
 
 
-def _judged(result: Result, failed: dict[str, str]) -> list[str]:
+def _judged(result: Result, failed: dict[str, str]) -> dict[str, str]:
     """What the mesh should be and is not; all of it, and what is odd, is told."""
     task, came, measured = result.task, result.meshed, result.measured
     problems = tell_violated(came.result, measured, task.source.mask_word)
     for name, reason in failed.items():
         left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
-        problems.append(f"{name} could not be measured: {reason}; {left}")
-        violated(problems[-1])
+        problems[name] = f"{name} could not be measured: {reason}; {left}"
+        violated(problems[name])
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     job, mode = task.plan.job, task.plan.mode
