@@ -76,25 +76,28 @@ def run(
         Called with a line on each thing that is done.
     """
     begin = time.perf_counter()
-    steps: list[tuple[str, Callable[[], dict[str, Any]]]] = [
-        ("Fig. 1: random nodes", lambda: _figure_1(paths, seeds)),
-        ("Fig. 2: synthetic phantom", lambda: _figure_2(paths)),
-        ("Fig. 2(b): energy of one node", lambda: _figure_2b(paths)),
-        ("Fig. 3(a, b): brain MR slice", lambda: _figure_3ab(paths, volume)),
-        ("Fig. 3(c, d): prostate elastography", lambda: _figure_3cd(paths)),
-        ("Fig. 3(e, f): brain MR volume", lambda: _figure_3ef(paths, volume)),
-    ]
+    steps: dict[str, Callable[[], dict[str, Any]]] = {
+        "fig1": lambda: _figure_1(paths, seeds), "fig2": lambda: _figure_2(paths), "fig2b": lambda: _figure_2b(paths),
+        "fig3ab": lambda: _figure_3ab(paths, volume), "fig3cd": lambda: _figure_3cd(paths),
+        "fig3ef": lambda: _figure_3ef(paths, volume),
+    }  # fmt: skip
     if tissue is not None:
-        steps.append(("Section 5: approximate segmentation", lambda: _segmentation(volume, tissue)))
+        steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
-    for title, step in steps:
-        say(title)
-        sections.append({"title": title, **step()})
+    for name, step in steps.items():
+        say(paper.printed()["sections"][name]["title"])
+        sections.append(step())
     seconds = time.perf_counter() - begin
     results = about | {"seeds": seeds, "versions": versions(), "seconds": seconds, "sections": sections}
     save_json(paths["paper.json"], results)
     _write_page(paths, results)
     return results
+
+
+def _section(name: str, **values: float) -> dict[str, Any]:
+    """Title and text of an experiment, with these numbers in it."""
+    said = paper.printed()["sections"][name]
+    return {"title": said["title"], "text": said["text"].format(**values)}
 
 
 def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
@@ -118,15 +121,7 @@ def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
     for name, errors in spread.items():
         low, middle, high = np.percentile(errors, [5, 50, 95], axis=0)
         rows.append(_row(name, middle[:4], middle[4]) | {"p5": low, "p95": high})
-    text = (
-        f"The paper shows one set of 61 random nodes and does not say how it was drawn; ours are medians of {seeds} "
-        "seeds, 24 nodes even on the boundary and 37 uniform inside; the picture is of seed 0. The harmonic mean (ii) "
-        "is far lower than printed, since a cell that comes out almost equilateral pulls it towards 0. It seems that "
-        "the paper printed geometric means: row 6 is of two kinds of triangles, so its (i), (iii) and (iv) fix their "
-        "errors, 0.0922 and 0.0795, whose harmonic mean is 0.0854 and geometric mean 0.0856, as printed. So each (ii) "
-        "stands here both ways."
-    )
-    return {"text": text, "errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
+    return _section("fig1", seeds=seeds) | {"errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
 
 
 def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
@@ -144,14 +139,8 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     }
     worst = cases[1].result.mesh
     flat = np.sort((0.5 - rho(worst.points, worst.cells)) ** 2)[-2:]
-    text = (
-        "Row 3 of Table 1 is set by the mesh alone and comes out to the printed digits. The phantom's shapes and the "
-        "number of iterations are not printed; ours are fig2_2d and 20. With k_D = 0.3 (iii) and (iv) come out higher "
-        f"than printed because of the two worst triangles, at the rim of our disc: {flat.sum():.2f} of the sum (iii) "
-        "is theirs; the paper's mode has no bound on shape."
-    )
-    return {
-        "text": text, "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
+    return _section("fig2", flat=flat.sum()) | {
+        "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
         "E_D_relative": {case.title: _E_D_relative(case) for case in cases},
         "pictures": [["fig2.png", "Fig. 2(a, c, d): mesh over the phantom, and the mean in each cell"]],
     }  # fmt: skip
@@ -170,13 +159,7 @@ def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
     landscapes = [paper.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
     save_figure(landscape_figure(landscapes), paths["fig2b.png"])
     minima = [{"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes]
-    text = (
-        "E over the place of the centre node of four triangles. As k_D grows the minimum leaves the middle for the "
-        "edge in the image. The descent starts in the middle and moves along the axes; it ends where no move along "
-        "either axis lowers E, which in a valley oblique to both (k_D = 0.8) need not be a minimum. Between the "
-        "grid's places it may end a little below the lowest of them (k_D = 0.05)."
-    )
-    return {"text": text, "minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
+    return _section("fig2b") | {"minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
 
 
 def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
@@ -184,12 +167,8 @@ def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     save_figure(
         slice_figure(case.image, [("initial", case.initial), ("k_D = 0.2", case.result.mesh)]), paths["fig3ab.png"]
     )
-    text = (
-        "The paper's slice is not published; this one is axial, at 47 % of the volume's height, which on the MNI152 "
-        "brain passes through the ventricles."
-    )
-    return {
-        "text": text, "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
+    return _section("fig3ab") | {
+        "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
         "pictures": [["fig3ab.png", "Fig. 3(a, b): 128 nodes, before and after 20 iterations"]],
     }  # fmt: skip
 
@@ -207,17 +186,8 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         before, after = (_simulated(case.image, mesh) for mesh in (case.initial, case.result.mesh))
         change = {name: after[name] / before[name] - 1.0 for name in after}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
-    text = (
-        "The elastography data are not published. A phantom, prostate_2d, is compressed by our plane-stress solve, "
-        "its axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those of "
-        "squares: (i), (iii) and (iv) are those of a box 2.2 % longer than wide. The largest eigenvalue and with it "
-        "the condition number are set by a few triangles in the stiffest nodule, so they hang on how the mesh happens "
-        "to cut it, and range widely over the noise levels; the paper's condition number rises less than any of ours. "
-        "The strain energy depends on how much of the box the stiff parts fill and on the modulus of the rest, which "
-        "the paper does not print; why its change is five times ours we cannot tell."
-    )
-    return {
-        "text": text, "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
+    return _section("fig3cd") | {
+        "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
         "printed_change": paper.printed()["change"],
         "pictures": [["fig3cd.png", "Fig. 3(c, d): approximate modulus, SNR 30 dB, before and after 15 iterations"]],
     }  # fmt: skip
@@ -233,14 +203,8 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     save_scenes(paths["fig3e.png"], [*scenes, ("surface from the voxels", isosurface_before_slices(image, surface))])
     shown = [("initial mesh", initial, before), ("optimised mesh", mesh, after)]
     save_scenes(paths["fig3f.png"], [(title, structure_before_slices(image, m, cells)) for title, m, cells in shown])
-    text = (
-        "The paper's volume is not published. Fig. 3(f) is the largest connected set of tetrahedra of mean below a "
-        f"threshold; here {below:.0f}, 0.6 x the median of the brighter voxels, which in the optimised mesh of the "
-        "MNI152 T1 gives the lateral ventricles. Beside the slices in Fig. 3(e) stands the isosurface of the voxels "
-        "at the same threshold, freed of the sulci by an erosion of one voxel."
-    )
-    return {
-        "text": text, "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+    return _section("fig3ef", below=below) | {
+        "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
         "structure": {"below": below, "n_cells_initial": len(before), "n_cells": len(after)},
         "pictures": [
             ["fig3e.png", "Fig. 3(e): slices embedded in the initial mesh, of which the lower part is drawn; surface"],
@@ -261,15 +225,9 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
         )
     }
     ratio = volume.data.size / len(case.initial.cells)
-    text = (
-        "Section 5 proposes an optimised mesh as a fast approximate segmentation and prints no numbers. Cells are "
-        "grouped by their means into K classes and painted back to the voxels; each class stands for the tissue that "
-        "most of its voxels carry, and a tissue for which no class stands has Dice 0. Beside it the same classes from "
-        f"the voxels themselves, which have {ratio:.0f} times as many values. The mesh has {len(case.initial.points)} "
-        "nodes. Labels of the MNI152: 0 background, 1 CSF, 2 grey, 3 white matter. Tissue thinner than a cell, as the "
-        "CSF round the brain, is out of reach."
-    )
-    return {"text": text, "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)}}
+    return _section("segmentation", ratio=ratio, nodes=len(case.initial.points)) | {
+        "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+    }  # fmt: skip
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
