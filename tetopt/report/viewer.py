@@ -17,16 +17,6 @@ from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
 from tetopt.report.page import data_html, packed, script_html
 
-VIEWS_STYLE = """
-.views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 320px), 1fr)); gap: 1rem; }
-.views figure { margin: 0; break-inside: avoid; }
-.views canvas { width: 100%; aspect-ratio: 1; display: block; background: #fff; border: 1px solid #ccc;
-  cursor: grab; touch-action: pan-y; }
-.views canvas:focus { outline: 3px solid #0072b2; } .views .failure { color: #a00000; }
-.viewer-buttons button { font: inherit; min-width: 2.6rem; min-height: 2.6rem; margin: 0 0.3rem 0.6rem 0; }
-@media print { .viewer-buttons, .viewer-hint { display: none; }
-  .views { grid-template-columns: repeat(3, 1fr); } .views canvas { border: none; } }
-"""
 TURNING_HINT = (
     "Drag to turn; all views turn together. The wheel zooms once a view is clicked; on a touch screen begin sideways "
     "to turn, and pinch to zoom. Keys: arrows, +, -, 0."
