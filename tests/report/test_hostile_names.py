@@ -9,7 +9,6 @@ import numpy as np
 import PIL.Image
 import pytest
 from browser import document
-from markupsafe import Markup
 
 from tetopt.geometry.topology import boundary_facets
 from tetopt.io.text import plain
@@ -95,7 +94,7 @@ def test_the_page_of_sections_and_views(mesh, server, tmp_path):
     pictures = [(tmp_path / "p.png", name) for name in names]
     sections = [{"title": name, "text": name, "tables": [[names, names]], "pictures": pictures} for name in names]
     content = rendered("report/sections.html", sections=sections)
-    write_page(tmp_path / "a.html", names[0], content + Markup(views_html(views)))
+    write_page(tmp_path / "a.html", names[0], content + views_html(views))
     check_shown(tmp_path / "a.html", server[1], names)
 
 

@@ -87,7 +87,7 @@ def test_titles_are_escaped_and_no_views_are_nothing(opened):
     _, _, view = opened
     text = views_html([view._replace(title='</script><b>"')])
     assert "</script><b>" not in text
-    assert 'aria-label="3-D view of &lt;/script&gt;&lt;b&gt;&quot;, opened' in text
+    assert 'aria-label="3-D view of &lt;/script&gt;&lt;b&gt;&#34;, opened' in text
     assert views_html([]) == ""
 
 

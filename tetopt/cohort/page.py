@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from markupsafe import Markup
-
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
@@ -100,7 +98,7 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
         "cohort/cohort.html", summary=_summary(rows, flags), reasons=reasons, most=LISTED_FAILURES, quote=quote,
         n_failed=sum(len(failed) for _, failed in reasons), note=note, first_subjects=subjects,
         first_words=f"The first {LISTED_SUBJECTS} of {len(rows)}." if len(rows) > LISTED_SUBJECTS else "",
-        data=Markup(data_html("data", _data(rows, flags, pictures, names))), script=Markup(script_html("cohort")),
+        data=data_html("data", _data(rows, flags, pictures, names)), script=script_html("cohort"),
     )  # fmt: skip
     write_page(path, f"Cohort {out.resolve().name}", content, package_text("cohort/cohort.css"))
 

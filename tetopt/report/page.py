@@ -64,8 +64,9 @@ def write_page(path: Path, title: str, content: str, style: str = "") -> None:
     `content` and `style` (CSS after the page's own) go in as they are, but for what is not printed, such as marks that
     turn the direction of writing, which is shown as Python escapes it; `title` is text. See `policy_html`.
     """
-    policy, title = Markup(policy_html()), plain(title)
-    page = rendered("report/page.html", policy=policy, title=title, style=Markup(style), content=Markup(content))
+    page = rendered(
+        "report/page.html", policy=policy_html(), title=plain(title), style=Markup(style), content=Markup(content)
+    )  # fmt: skip
     save_text(path, printed(f"{page}\n"))
 
 
@@ -86,11 +87,11 @@ def packed(numbers: NDArray, kind: str) -> str:
     return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
 
 
-def data_html(name: str, data: Any) -> str:
+def data_html(name: str, data: Any) -> Markup:
     """Markup of data for a script, as JSON in the element `name`."""
     # An HTML parser ends a script at "</script" wherever it stands, also in a string.
     text = json.dumps(_shown(data), allow_nan=False).replace("<", "\\u003c")
-    return f'<script type="application/json" id="{name}">{text}</script>'
+    return Markup(f'<script type="application/json" id="{name}">{text}</script>')
 
 
 def _shown(data: Any) -> Any:
@@ -102,9 +103,9 @@ def _shown(data: Any) -> Any:
     return plain(data) if isinstance(data, str) else data
 
 
-def script_html(name: str) -> str:
+def script_html(name: str) -> Markup:
     """Markup of one of `PAGE_SCRIPTS`."""
-    return f"<script>{_script(name)}</script>"
+    return Markup(f"<script>{_script(name)}</script>")
 
 
 @cache
@@ -114,7 +115,7 @@ def _script(name: str) -> str:
     return "\n".join(["", '"use strict";', "(() => {", *texts, "})();", ""])
 
 
-def policy_html() -> str:
+def policy_html() -> Markup:
     """Markup by which a page forbids itself the network, forms, and all scripts but our own.
 
     What slipped in with a name neither runs nor is fetched: scripts are let in by the hash of their text.
@@ -124,7 +125,7 @@ def policy_html() -> str:
     scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
     rules = ["default-src 'none'", "img-src data:", "style-src 'unsafe-inline'", f"script-src {scripts}"]
     rules += ["base-uri 'none'", "form-action 'none'"]
-    return f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">'
+    return Markup(f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">')
 
 
 def printed(markup: str) -> str:

@@ -15,6 +15,11 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
+from tetopt.io.images import sha256
+from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.job.events import note
+from tetopt.job.inputs import checked_outputs, image_and_labels
+from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
 from tetopt.phantom import load_phantom
@@ -30,7 +35,7 @@ from tetopt.report.scene import (
 from tetopt.report.summary import versions
 from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
-from tetopt.system.files import save_json
+from tetopt.system.files import results_folder, save_json
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)
@@ -42,39 +47,43 @@ CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.j
 ERROR_NAMES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
 
 
-def check_inputs(volume: Image, tissue: Image | None) -> None:
-    """InputError for a volume too small or too plain for the figures, or labels that are none."""
-    if min(volume.shape) < 16 or volume.data.min() == volume.data.max():
-        raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
-    if tissue is not None:
-        check_labels("labels", tissue)
-
-
-def run(
-    paths: dict[str, Path],
-    about: dict[str, Any],
-    volume: Image,
-    tissue: Image | None,
-    seeds: int,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Run every experiment, write the files `PAPER_FILES`, return what `paper.json` holds.
+def reproduce(
+    output: Path, image_path: Path | None, labels_path: Path | None, seeds: int, force: bool = False
+) -> tuple[Path, float]:
+    """Run every experiment, write the files `PAPER_FILES` into a folder; the page, and the seconds that it took.
 
     Parameters
     ----------
-    paths : dict
-        Where each of them goes, by its name.
-    about : dict
-        Names of the files read, for the record.
-    volume : Image
-        A brain MR volume, CSF dark, for Fig. 3(a, b, e, f) and the segmentation.
-    tissue : Image or None
-        Its tissue labels, on the same voxels; without them the segmentation is left out.
+    output : Path
+    image_path : Path or None
+        A brain MR volume, CSF dark, for Fig. 3(a, b, e, f) and the segmentation; None: nilearn's MNI152.
+    labels_path : Path or None
+        Its tissue labels, on the same voxels; None: those of the MNI152, or no section on segmentation.
     seeds : int
         Number of random meshes for Fig. 1.
-    say : callable
-        Called with a line on each thing that is done.
+    force : bool
+        Replace the files of an earlier run.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or written, or a volume too small or too plain for the figures.
     """
+    if seeds < 1:
+        raise InputError(f"`seeds`: expected 1 or more, got {seeds}")
+    source = mni_path("t1") if image_path is None else image_path
+    volume, tissue = image_and_labels(source, labels_path, WHOLE_BOX)
+    labels_name = None if labels_path is None else labels_path.name
+    if image_path is None and labels_path is None:
+        tissue, labels_name = mni_tissue(), "MNI152 tissue"
+    if min(volume.shape) < 16 or volume.data.min() == volume.data.max():
+        raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
+    if tissue is None:
+        note("no `labels`: the section on approximate segmentation is left out")
+    else:
+        check_labels("labels", tissue)
+    paths = checked_outputs(results_folder(output), PAPER_FILES, force)
+    about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     begin = time.perf_counter()
     steps: dict[str, Callable[[], dict[str, Any]]] = {
         "fig1": lambda: _figure_1(paths, seeds), "fig2": lambda: _figure_2(paths), "fig2b": lambda: _figure_2b(paths),
@@ -85,13 +94,13 @@ def run(
         steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
     for name, step in steps.items():
-        say(paper.printed()["sections"][name]["title"])
+        note(paper.printed()["sections"][name]["title"])
         sections.append(step())
     seconds = time.perf_counter() - begin
     results = about | {"seeds": seeds, "versions": versions(), "seconds": seconds, "sections": sections}
     save_json(paths["paper.json"], results)
     _write_page(paths, results)
-    return results
+    return paths["paper.html"], seconds
 
 
 def _section(name: str, **values: float) -> dict[str, Any]:
@@ -237,16 +246,10 @@ def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
         pictures = [(folder / name, caption) for name, caption in section.get("pictures", ())]
         tables = [_lines(section), _minima_lines(section), _dice_lines(section)]
         pages.append({"title": section["title"], "text": section["text"], "pictures": pictures, "tables": tables})
-    intro = (
-        "O. Goksel and S. E. Salcudean, High-Quality Model Generation for Finite Element Simulation of Tissue "
-        f"Deformation: each printed number beside tetopt's ({results['versions']['tetopt']}), run on "
-        f"{results['image']}. Errors are of the radius ratio rho = inradius / circumradius, 1/2 on an equilateral "
-        "triangle and 1/3 on a regular tetrahedron: (i) mean, (ii) harmonic mean, (iii) sum of squares and (iv) "
-        "maximum of 1/n - rho, n the dimension; smaller is better. E_G is the shape energy, Eq. (1), E_D the image "
-        "energy, Eq. (3), k_D its weight in E, Eq. (4)."
-    )
+    words = paper.printed()["page"]
+    intro = words["intro"].format(version=results["versions"]["tetopt"], image=results["image"])
     if not any(section.get("dice") and "Section 5" in section["title"] for section in results["sections"]):
-        intro += " Section 5, segmentation, is left out: no tissue labels were given."
+        intro += words["no_labels"]
     pages.insert(0, {"title": "What this is", "text": intro})
     save_page(paths["paper.html"], "The paper's figures and table, reproduced", pages)
 
