@@ -25,6 +25,7 @@ from tetopt.energy.sampling import nearest_values
 from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import compare
 from tetopt.geometry.quadratic import gauss_rule, quadratic
+from tetopt.job.events import listened
 from tetopt.model.averages import element_young, parse_average
 from tetopt.study.compare import Standard, default_mapping, prepared
 from tetopt.study.compare_report import Settings
@@ -67,9 +68,8 @@ def _run(options: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        standard = prepared(
-            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
-        )
+        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepared(image, labels, mapping, settings)
         for order in options.orders:
             for mode in options.modes:
                 mesh = _mesh(image, mode, options.nodes, order)

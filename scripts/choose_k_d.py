@@ -18,6 +18,7 @@ import numpy as np
 
 import tetopt
 from tetopt.fem.reference import averaged
+from tetopt.job.events import listened
 from tetopt.measure.segmentation import thresholded
 from tetopt.study.compare import default_mapping, measured, prepared
 from tetopt.study.compare_report import Settings, Simulation
@@ -51,9 +52,8 @@ def _run(options: argparse.Namespace) -> int:
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        standard = prepared(
-            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
-        )
+        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepared(image, labels, mapping, settings)
         for nodes in options.nodes:
             initial = tetopt.lattice_mesh(image, nodes=nodes)
             for k_D in options.k_d:

@@ -20,6 +20,7 @@ from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases, error_of
 
 import tetopt
 from tetopt.fem.reference import at_centres
+from tetopt.job.events import listened
 from tetopt.start.sizes import COARSEST_RATIO
 from tetopt.study.compare import Standard, default_mapping, measured, prepared
 from tetopt.study.compare_report import Settings
@@ -52,9 +53,8 @@ def _run(options: argparse.Namespace) -> int:
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        standard = prepared(
-            image, labels, mapping, settings, lambda text, name=name: print(f"{name}: {text}", flush=True)
-        )
+        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepared(image, labels, mapping, settings)
         for kind, mesh in _meshes(image, standard, options.nodes, options.largest):
             numbers = measured(standard, mesh, settings.percent)
             rows.append({"image": name, "mesh": kind, "measured": numbers})

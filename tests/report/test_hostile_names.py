@@ -17,12 +17,9 @@ from tetopt.report.exhibit import exhibit
 from tetopt.report.explore import save_explorer
 from tetopt.report.page import (
     PAGE_SCRIPTS,
-    paragraph_html,
-    picture_html,
     policy_html,
+    rendered,
     script_html,
-    section_html,
-    table_html,
     write_page,
 )
 from tetopt.report.viewer import View, views_html
@@ -94,9 +91,10 @@ def test_the_page_of_sections_and_views(mesh, server, tmp_path):
     outside = boundary_facets(mesh.cells)
     views = [View(name, mesh.points, outside, np.arange(len(outside), dtype=float)) for name in names[:3]]
     PIL.Image.fromarray(np.zeros((2, 2), dtype=np.uint8)).save(tmp_path / "p.png")
-    parts = [picture_html(tmp_path / "p.png", name) for name in names]
-    parts += [section_html(name, [table_html([names, names], name), paragraph_html(name)]) for name in names]
-    write_page(tmp_path / "a.html", names[0], [*parts, views_html(views)])
+    pictures = [(tmp_path / "p.png", name) for name in names]
+    sections = [{"title": name, "text": name, "tables": [[names, names]], "pictures": pictures} for name in names]
+    content = rendered("report/sections.html", sections=sections)
+    write_page(tmp_path / "a.html", names[0], content + views_html(views))
     check_shown(tmp_path / "a.html", server[1], names)
 
 
@@ -122,7 +120,7 @@ def leak(address):
 def test_what_slips_in_neither_runs_nor_is_fetched(server, tmp_path):
     """The policy of a page is a second wall behind the escaping; without it the same markup does what it can."""
     address, paths = server
-    write_page(tmp_path / "a.html", "t", [leak(address)])
+    write_page(tmp_path / "a.html", "t", leak(address))
     assert "data-xss" not in document(tmp_path / "a.html", is_silent=False)
     assert paths == []
     without = (tmp_path / "a.html").read_text(encoding="utf-8").replace(policy_html(), "")

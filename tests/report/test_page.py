@@ -2,11 +2,12 @@
 
 import re
 
+import jinja2
 import numpy as np
 import PIL.Image
 import pytest
 
-from tetopt.report.page import picture_html, save_page, section_html, table_html, write_page
+from tetopt.report.page import picture_html, rendered, save_page, write_page
 
 EVIL = '<b onclick="x">&\''
 
@@ -22,9 +23,7 @@ def test_text_is_escaped(tmp_path):
     save_page(tmp_path / "a.html", EVIL, [section])
     page = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<b " not in page
-    assert (
-        page.count("&lt;b onclick=&quot;x&quot;&gt;&amp;&#x27;") == 8
-    )  # title twice, head, text, 2 cells, alt, caption
+    assert page.count("&lt;b onclick=&#34;x&#34;&gt;&amp;&#39;") == 8  # title twice, head, text, 2 cells, alt, caption
 
 
 def test_a_picture_keeps_its_size_and_a_wide_one_scrolls(tmp_path):
@@ -34,16 +33,22 @@ def test_a_picture_keeps_its_size_and_a_wide_one_scrolls(tmp_path):
     assert 'class="wide broad"' in picture_html(wide, "")
 
 
-def test_table_has_a_head_and_a_caption():
-    markup = table_html([["a", "b"], ["1", "2"]], "C")
-    assert re.sub(r"</?div[^>]*>", "", markup) == (
-        "<table><caption>C</caption><thead><tr><th>a</th><th>b</th></tr></thead>"
-        "<tbody><tr><td>1</td><td>2</td></tr></tbody></table>"
-    )
+def test_table_has_a_head_and_without_rows_there_is_none():
+    section = {"title": "s", "text": "", "tables": [[["a", "b"], ["1", "2"]], []]}
+    markup = re.sub(r"</?div[^>]*>|\s", "", rendered("report/sections.html", sections=[section]))
+    assert markup.count("<table>") == 1
+    assert (
+        "<table><thead><tr><th>a</th><th>b</th></tr></thead><tbody><tr><td>1</td><td>2</td></tr></tbody></table>"
+    ) in markup
+
+
+def test_a_name_that_a_template_lacks_is_an_error():
+    with pytest.raises(jinja2.UndefinedError):
+        rendered("report/page.html", title="t")
 
 
 def test_the_page_forbids_the_network(tmp_path):
-    write_page(tmp_path / "a.html", "STYLE TITLE", [section_html("s", ["<p>x</p>"])], "p { color: red; }")
+    write_page(tmp_path / "a.html", "STYLE TITLE", "<p>x</p>", "p { color: red; }")
     page = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "default-src 'none'" in page
     assert "<h1>STYLE TITLE</h1>" in page

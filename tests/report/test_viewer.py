@@ -12,8 +12,8 @@ from browser import BLIND, browser, copied, document
 import tetopt
 from tetopt.errors import InputError
 from tetopt.report.colours import grey_limits
-from tetopt.report.page import write_page
-from tetopt.report.viewer import VIEWS_STYLE, View, view_of, views_html
+from tetopt.report.page import package_text, write_page
+from tetopt.report.viewer import View, view_of, views_html
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_titles_are_escaped_and_no_views_are_nothing(opened):
     _, _, view = opened
     text = views_html([view._replace(title='</script><b>"')])
     assert "</script><b>" not in text
-    assert 'aria-label="3-D view of &lt;/script&gt;&lt;b&gt;&quot;, opened' in text
+    assert 'aria-label="3-D view of &lt;/script&gt;&lt;b&gt;&#34;, opened' in text
     assert views_html([]) == ""
 
 
@@ -107,9 +107,8 @@ def test_size(opened):
 def page(tmp_path_factory, opened):
     folder = tmp_path_factory.mktemp("viewer")
     mesh, _, view = opened
-    write_page(
-        folder / "a.html", "t", [views_html([view, view_of(mesh, np.zeros(len(mesh.cells)), "flat")])], VIEWS_STYLE
-    )
+    views = views_html([view, view_of(mesh, np.zeros(len(mesh.cells)), "flat")])
+    write_page(folder / "a.html", "t", views, package_text("report/viewer.css"))
     return folder / "a.html"
 
 

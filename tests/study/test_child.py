@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.job.events import Event, listened
 from tetopt.study.child import run_in_child
 from tetopt.study.endings import last_line
 from tetopt.study.pipelines import PIPELINES, PipelineInput
@@ -67,9 +68,10 @@ def test_failure_is_one_line(pipeline, line):
 def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     """And said; what else goes wrong is not repeated, and what is not installed is no failure like the others."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
-    lines = []
-    outcome = run_in_child(pipes.crash_once, JOB, max_seconds=60.0, say=lines.append)
-    assert lines == ["crashed: signal 11, SIGSEGV; once more"]
+    events = []
+    with listened(events.append):
+        outcome = run_in_child(pipes.crash_once, JOB, "mine", max_seconds=60.0)
+    assert events == [Event("note", "mine: crashed: signal 11, SIGSEGV; once more")]
     assert outcome.failure is None
     assert outcome.reason is None
     assert outcome.crashes == ("crashed: signal 11, SIGSEGV",)
@@ -78,15 +80,16 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     outcome = run_in_child(pipes.crash_and_refuse, JOB, max_seconds=60.0)
     assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"
     assert (outcome.reason, len(outcome.crashes)) == ("error", 1)
-    lines.clear()
+    events.clear()
     for pipeline, reason, n_crashes in (
         (pipes.crash, "crash", 2),
         (pipes.refuse, "error", 0),
         (pipes.absent, "missing", 0),
     ):
-        outcome = run_in_child(pipeline, JOB, max_seconds=60.0, say=lines.append)
+        with listened(events.append):
+            outcome = run_in_child(pipeline, JOB, max_seconds=60.0)
         assert (outcome.reason, len(outcome.crashes)) == (reason, n_crashes)
-    assert len(lines) == 1
+    assert len(events) == 1
 
 
 def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):

@@ -20,7 +20,6 @@ from typer.models import OptionInfo
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
 from tetopt.errors import InputError
 from tetopt.job.options import (
-    AVERAGE_OPTION,
     IMAGE_FILES,
     ForceOption,
     JsonOption,
@@ -42,7 +41,6 @@ ImageArgument = Annotated[Path, typer.Argument(metavar="IMAGE", help=IMAGE_FILES
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
 ]
-AverageOption = Annotated[str, AVERAGE_OPTION]
 PredictOption = Annotated[
     bool, typer.Option("--predict", help="Tell how long the run takes and how much memory, and write nothing.")
 ]

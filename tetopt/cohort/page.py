@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
-import html
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -18,7 +17,7 @@ from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
 from tetopt.errors import InputError
 from tetopt.model.labels import label_words
-from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
+from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
 from tetopt.system.incoming import own_bytes
 
 PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
@@ -81,7 +80,6 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     four digits; above `PAGE_NUMBERS` of them labels are left out, those that most subjects have last. Above
     `PAGE_PICTURES` subjects only these have pictures in it: those that are flagged, and of the others every so many.
     """
-    parts = [*_summary(rows, flags), *_failures(rows)]
     pictures = _pictures(out, rows, flags)
     names, left_out = _columns(rows)
     is_solid = any(row.numbers.get("quality.ndim") == 3 for row in rows)
@@ -95,12 +93,14 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
         )
     if left_out:
         note += f" Numbers of {left_out} more labels are in cohort.tsv alone."
-    parts.append(section_html("Distributions", ['<div id="charts"></div>', _SCRIPTLESS]))
-    table = ['<div id="controls"></div>', '<div id="subjects">', _first_subjects(rows, flags), "</div>"]
-    parts.append(section_html("Subjects", [paragraph_html(note), *table]))
-    parts.append(data_html("data", _data(rows, flags, pictures, names)))
-    parts.append(script_html("cohort"))
-    write_page(path, f"Cohort {out.resolve().name}", parts, _STYLE)
+    reasons, subjects = _failures(rows), list(_first_subjects(rows, flags))
+    content = rendered(
+        "cohort/cohort.html", summary=_summary(rows, flags), reasons=reasons, most=LISTED_FAILURES, quote=quote,
+        n_failed=sum(len(failed) for _, failed in reasons), note=note, first_subjects=subjects,
+        first_words=f"The first {LISTED_SUBJECTS} of {len(rows)}." if len(rows) > LISTED_SUBJECTS else "",
+        data=data_html("data", _data(rows, flags, pictures, names)), script=script_html("cohort"),
+    )  # fmt: skip
+    write_page(path, f"Cohort {out.resolve().name}", content, package_text("cohort/cohort.css"))
 
 
 def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
@@ -117,12 +117,12 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     options = _options(rows)
     common = [f"{_option(name)} {_shown(next(iter(each)))}" for name, each in options.items() if len(each) == 1]
     different = [f"{_option(name)}: {_counted(each)}" for name, each in options.items() if len(each) > 1]
-    parts = [paragraph_html(text), *map(paragraph_html, unjudged(rows))]
+    lines = [text, *unjudged(rows)]
     if common:
-        parts.append(paragraph_html(f"Of all meshes: {', '.join(common)}."))
+        lines.append(f"Of all meshes: {', '.join(common)}.")
     if different:
-        parts.append(paragraph_html(f"Different, with how many subjects have each: {'; '.join(different)}."))
-    return parts
+        lines.append(f"Different, with how many subjects have each: {'; '.join(different)}.")
+    return lines
 
 
 def _option(name: str) -> str:
@@ -145,29 +145,13 @@ def _options(rows: Sequence[Row]) -> dict[str, Counter[Value]]:
     return {name: each for name, each in counts.items() if set(each) != {None}}
 
 
-def _failures(rows: Sequence[Row]) -> list[str]:
-    """The subjects that failed, those of one reason together, each linked to its log."""
+def _failures(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """The subjects that failed, those of one reason together, the most frequent first."""
     reasons: dict[str, list[Row]] = {}
     for row in rows:
         if row.status == "failed":
             reasons.setdefault(row.reason, []).append(row)
-    if not reasons:
-        return []
-    head = "<tr><th>why</th><th>subjects, with their logs</th></tr>"
-    lines = [f"<div class='wide'><table class='failures'><thead>{head}</thead>"]
-    for reason, failed in sorted(reasons.items(), key=lambda each: -len(each[1]))[:LISTED_FAILURES]:
-        names = [_linked(row.key, row.files.get("log")) for row in failed[:LISTED_FAILURES]]
-        more = f" and {len(failed) - len(names)} more" if len(failed) > len(names) else ""
-        lines.append(f"<tr><td>{html.escape(reason)}</td><td>{', '.join(names)}{more}</td></tr>")
-    lines.append("</table></div>")
-    if len(reasons) > LISTED_FAILURES:
-        lines.append(paragraph_html(f"And {len(reasons) - LISTED_FAILURES} reasons more, in the table of subjects."))
-    return [section_html(f"Failed: {sum(map(len, reasons.values()))}", lines)]
-
-
-def _linked(text: str, path: str | None) -> str:
-    """Markup of a text, which is a link if there is a file for it."""
-    return html.escape(text) if path is None else f'<a href="{html.escape(quote(path))}">{html.escape(text)}</a>'
+    return sorted(reasons.items(), key=lambda each: -len(each[1]))
 
 
 def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str | None]:
@@ -254,57 +238,9 @@ def _shown(value: Value) -> Value:
     return float(f"{value:.{SHOWN_DIGITS}g}") if isinstance(value, float) else value
 
 
-def _first_subjects(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> str:
-    """Markup of the first subjects, the odd ones before the others, for browsers without scripts."""
-    order = sorted(range(len(rows)), key=lambda place: -len(flags[place]))[:LISTED_SUBJECTS]
-    lines = [["subject", "status", "what is odd"]]
-    for place in order:
+def _first_subjects(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> Iterator[list[str]]:
+    """Rows of the first subjects, the odd ones before the others, for browsers without scripts."""
+    for place in sorted(range(len(rows)), key=lambda place: -len(flags[place]))[:LISTED_SUBJECTS]:
         row = rows[place]
         odd = "; ".join(flag.words for flag in flags[place][:LISTED_FLAGS])
-        lines.append([row.key, STATUS_WORDS[row.status], row.reason if row.status == "failed" else odd])
-    more = f"The first {LISTED_SUBJECTS} of {len(rows)}." if len(rows) > LISTED_SUBJECTS else ""
-    return table_html(lines, more)
-
-
-_SCRIPTLESS = (
-    "<noscript><p>Distributions, sorting and pictures need scripts, which this browser does not run.</p></noscript>"
-)
-_STYLE = """
-main { max-width: 1500px; }
-table.failures td, table.failures th { text-align: left; vertical-align: top; white-space: normal; }
-table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
-.same { color: #555; } #charts details { margin-top: 1rem; }
-.subjects td:last-child { white-space: nowrap; }
-.charts { display: flex; flex-wrap: wrap; gap: 0.8rem 1.4rem; } .chart { width: 230px; font-size: 0.85rem; }
-.chart .title { font-weight: 600; line-height: 1.25; min-height: 2.5em; display: flex; align-items: flex-end; }
-#subjects table:not(.subjects) :is(td, th) { text-align: left; }
-.chart .title { overflow-wrap: anywhere; } .chart svg { display: block; width: 100%; border-bottom: 1px solid #999; }
-.foot { display: flex; justify-content: space-between; color: #555; font-size: 0.8rem; gap: 0.5rem; }
-.foot.texts { justify-content: flex-start; }
-.bar { cursor: pointer; } .bar .back { fill: transparent; } .bar .usual { fill: #7a8fa6; } .bar .far { fill: #d95f02; }
-.bar:hover .back, .bar:focus .back { fill: #e6ebf0; } .bar:focus { outline: none; }
-.controls { display: flex; flex-wrap: wrap; gap: 0.6rem; align-items: flex-start; }
-.controls input[type=search] { flex: 0 1 16rem; } .controls details { max-width: 100%; }
-.controls input, .controls select, .pager button, .chips button { font: inherit; padding: 0.2rem 0.5rem; }
-.boxes { display: flex; flex-wrap: wrap; gap: 0.1rem 1rem; max-height: 14rem; overflow-y: auto; font-size: 0.9rem; }
-.chips button { margin: 0.5rem 0.5rem 0 0; background: #e6ebf0; border: 1px solid #7a8fa6; border-radius: 1rem; }
-.pager { margin: 0.7rem 0; }
-.subjects td { vertical-align: top; } .subjects td.odd { text-align: left; white-space: normal; min-width: 16rem; }
-.subjects td.odd div { margin-bottom: 0.2rem; line-height: 1.3; overflow-wrap: anywhere; }
-.subjects th { vertical-align: bottom; white-space: normal; line-height: 1.2; }
-.subjects th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer; }
-.subjects th button { text-align: inherit; color: inherit; } .subjects th:nth-child(2) { text-align: left; }
-.flag { color: #a33f00; } td.flag { font-weight: 600; } .bad { color: #b00020; }
-.badge { font-size: 0.78rem; padding: 0 0.4rem; border-radius: 0.7rem; background: #eee; white-space: nowrap; }
-.badge.failed, .badge.missing { background: #b00020; color: #fff; } .badge.violated { background: #d95f02; color: #fff;
-}
-.badge.done { background: #e3efe6; } .picture img { display: block; margin-top: 0.2rem; background: #000; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(256px, 1fr)); gap: 0.8rem; font-size: 0.85rem; }
-.tile { padding: 0.3rem; border: 1px solid #ddd; overflow-wrap: anywhere; } .tile.odd { border-color: #d95f02; }
-@media screen and (max-width: 700px) {
-  .chart { width: calc(50% - 0.7rem); } .subjects .picture img { width: 150px; } .subjects td.odd { min-width: 10rem; }
-  .subjects td, .subjects th { padding: 0.25rem 0.4rem; } .name .badge { display: inline-block; }
-  .subjects td:first-child { min-width: 150px; white-space: normal; overflow-wrap: anywhere; }
-  .controls input[type=search] { flex: 1 1 100%; }
-}
-"""
+        yield [row.key, STATUS_WORDS[row.status], row.reason if row.status == "failed" else odd]

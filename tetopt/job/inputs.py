@@ -62,6 +62,12 @@ def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
     return labels
 
 
+def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
+    """The volume, and labels on its voxels, if they are given."""
+    image = read_volume(path, part)
+    return image, None if labels_path is None else read_labels(labels_path, image, part)
+
+
 def image_and_others(
     path: Path, part: ImagePart
 ) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:

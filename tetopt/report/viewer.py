@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
@@ -15,22 +15,7 @@ from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.io.text import plain
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
-from tetopt.report.page import data_html, packed, script_html
-
-VIEWS_STYLE = """
-.views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 320px), 1fr)); gap: 1rem; }
-.views figure { margin: 0; break-inside: avoid; }
-.views canvas { width: 100%; aspect-ratio: 1; display: block; background: #fff; border: 1px solid #ccc;
-  cursor: grab; touch-action: pan-y; }
-.views canvas:focus { outline: 3px solid #0072b2; } .views .failure { color: #a00000; }
-.viewer-buttons button { font: inherit; min-width: 2.6rem; min-height: 2.6rem; margin: 0 0.3rem 0.6rem 0; }
-@media print { .viewer-buttons, .viewer-hint { display: none; }
-  .views { grid-template-columns: repeat(3, 1fr); } .views canvas { border: none; } }
-"""
-TURNING_HINT = (
-    "Drag to turn; all views turn together. The wheel zooms once a view is clicked; on a touch screen begin sideways "
-    "to turn, and pinch to zoom. Keys: arrows, +, -, 0."
-)
+from tetopt.report.page import data_html, packed, rendered, script_html
 
 
 class View(NamedTuple):
@@ -76,27 +61,15 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
     return View(title, mesh.points[used], triangles.reshape(-1, 3), values[sides.cells[sides.n_cells == 1, 0]])
 
 
-def views_html(views: Sequence[View]) -> str:
+def views_html(views: Sequence[View]) -> Markup:
     """Markup of the views side by side, turned together; with their data and script, without outside references.
 
     A browser without WebGL 2 or scripts says so in words.
     """
     if not views:
-        return ""
-    figures = [
-        f'<figure><canvas tabindex="0" role="img" aria-label="3-D view of {title}, opened; drag or press the arrow '
-        f'keys to turn it, plus and minus to zoom"></canvas><figcaption>{title}</figcaption></figure>'
-        for title in (html.escape(plain(view.title)) for view in views)
-    ]
-    return "\n".join(
-        [
-            f'<p class="viewer-hint">{html.escape(TURNING_HINT)}</p><div class="viewer-buttons"></div>',
-            '<div class="views">', *figures, "</div>",
-            "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
-            data_html("views-data", _views_data(views)),
-            script_html("viewer"),
-        ]
-    )  # fmt: skip
+        return Markup()
+    titles, data = [plain(view.title) for view in views], data_html("views-data", _views_data(views))
+    return rendered("report/viewer.html", titles=titles, data=data, script=script_html("viewer"))
 
 
 def _views_data(views: Sequence[View]) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.job.events import note
 from tetopt.mesh import Mesh
 from tetopt.study.endings import Crashed, NotInstalled, last_line
 from tetopt.study.pipelines import PipelineInput, Produced
@@ -49,10 +50,10 @@ class Outcome(NamedTuple):
 def run_in_child(
     pipeline: Callable[[PipelineInput], Produced],
     job: PipelineInput,
+    title: str = "a pipeline",
     *,
     max_seconds: float = float("inf"),
     max_bytes: int | None = None,
-    say: Callable[[str], None] = lambda line: None,
 ) -> Outcome:
     """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
 
@@ -65,13 +66,13 @@ def run_in_child(
         The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its temporary files, and
         those of programs that it runs, lie in a folder that goes away with the child, however it ends.
     job : PipelineInput
+    title : str
+        What the note that a run is repeated calls it.
     max_seconds : float
         Wall time of one run, the child's start included, after which it is killed with all that it started.
     max_bytes : int, optional
         Resident memory at which it is killed. It is looked at twenty times a second, so a fast run may pass it by a
         little.
-    say : callable
-        Called with a line when a run is repeated.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def run_in_child(
     if first.reason != "crash":
         return first
     crash = first.failure or ""
-    say(f"{crash}; once more")
+    note(f"{title}: {crash}; once more")
     again = _run_once(pipeline, job, max_seconds, max_bytes)
     again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes), crashes=(*first.crashes, *again.crashes))
     if again.failure is None:

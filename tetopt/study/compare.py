@@ -34,6 +34,7 @@ from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
+from tetopt.job.events import note
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
@@ -73,7 +74,6 @@ from tetopt.system.files import save_json
 from tetopt.system.incoming import own_bytes, text_of
 from tetopt.system.work_directory import LOCK_NAME, Layout, create, opened
 
-Say = Callable[[str], None]
 Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its settings, as JSON has it
 # Settings that no finished run's numbers depend on: what else is compared, and limits that a finished run kept to. Its
 # own number of nodes and its program are told besides; the reference's size is, once it is decided.
@@ -117,7 +117,6 @@ class Bench(NamedTuple):
     standard: Standard
     pipelines: dict[str, Pipeline]
     folder: Path  # of the runs' files
-    say: Say
     resume: bool
     facts: Facts
 
@@ -131,7 +130,7 @@ def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
     return [(low, 1.0), (high, 10.0)], words
 
 
-def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Settings, say: Say) -> Standard:
+def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Settings) -> Standard:
     """The reference solutions, which take a while.
 
     Raises
@@ -142,11 +141,11 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
     fine = young_image(image, mapping)
     dofs = settings.reference_dofs
     if dofs is None:
-        dofs = reference_dofs(image, mapping, settings, say)
+        dofs = reference_dofs(image, mapping, settings)
     modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
-        say(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
+        note(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
         references[f"{nu:g}"] = reference(modulus, nu, settings.percent)
     return Standard(
         image,
@@ -159,15 +158,15 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
     )
 
 
-def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings, say: Say) -> int:
+def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings) -> int:
     """Size of the reference that `reference_seconds` and the memory allow; another one in every run, by a little."""
     budget = affordable_dofs(young_image(image, mapping), settings.nus, settings.reference_seconds, settings.percent)
     limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
-    say(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
+    note(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
     return budget.dofs
 
 
-def _settled(comparison: Comparison, facts: Facts, runs: Path, say: Say, *, resume: bool) -> Comparison:
+def _settled(comparison: Comparison, facts: Facts, runs: Path, *, resume: bool) -> Comparison:
     """The size of the reference decided, and kept in the runs' folder for `resume`."""
     settings, path = comparison.settings, runs / "reference.json"
     if settings.reference_dofs is None:
@@ -175,7 +174,7 @@ def _settled(comparison: Comparison, facts: Facts, runs: Path, say: Say, *, resu
         before = _read_back(path) if resume else None
         dofs = None if before is None or before[0] != choice else before[1]
         if dofs is None:
-            dofs = reference_dofs(comparison.image, comparison.mapping, settings, say)
+            dofs = reference_dofs(comparison.image, comparison.mapping, settings)
             _write_down(path, [choice, dofs])
         comparison = comparison._replace(settings=settings._replace(reference_dofs=dofs))
     return comparison
@@ -299,7 +298,7 @@ def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, 
 
 
 def run(
-    folder: Path, comparison: Comparison, classes: Image, say: Say, *, resume: bool = False
+    folder: Path, comparison: Comparison, classes: Image, *, resume: bool = False
 ) -> tuple[Report, dict[int, dict[str, Mesh]]]:
     """Run and measure every pipeline, for linear and for quadratic cells.
 
@@ -313,8 +312,6 @@ def run(
         Without labels the pipelines that segment find `settings.classes` classes.
     classes : Image
         Materials for the rows by label and the interfaces: the labels given, or classes of the voxels.
-    say : callable
-        Called with a line on each thing that is done.
     resume : bool
         Keep finished runs of the same image, settings and versions.
 
@@ -332,20 +329,20 @@ def run(
         work = stack.enter_context(opened(runs, RUNS))
         work.check()
         work.lock(stack, LOCK_NAME, is_shared=False, what=str(runs))
-        return _run(runs, comparison, classes, say, resume=resume)
+        return _run(runs, comparison, classes, resume=resume)
 
 
 def _run(
-    runs: Path, comparison: Comparison, classes: Image, say: Say, *, resume: bool
+    runs: Path, comparison: Comparison, classes: Image, *, resume: bool
 ) -> tuple[Report, dict[int, dict[str, Mesh]]]:
     """The comparison, with the work directory of its runs."""
     begin = time.perf_counter()
     facts = _facts(comparison)
-    comparison = _settled(comparison, facts, runs, say, resume=resume)
+    comparison = _settled(comparison, facts, runs, resume=resume)
     image, settings = comparison.image, comparison.settings
-    standard = prepared(image, classes, comparison.mapping, settings, say)
+    standard = prepared(image, classes, comparison.mapping, settings)
     pipelines = pipelines_with(settings.programs)
-    bench = Bench(comparison, standard, pipelines, runs, say, resume, facts)
+    bench = Bench(comparison, standard, pipelines, runs, resume, facts)
     results: dict[int, list[PipelineResult]] = {1: [], 2: []}
     meshes: dict[int, dict[str, Mesh]] = {1: {}, 2: {}}
     curves = []
@@ -359,9 +356,7 @@ def _run(
         curves.append(_curve(bench, results[order][-1], order))
     sweep: list[TradeoffRow] = []
     for order in results if settings.tradeoff else ():
-        sweep += tradeoff(
-            image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of), say
-        )
+        sweep += tradeoff(image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of))
     report = Report(
         command=comparison.command,
         image=ImageFacts(
@@ -486,17 +481,16 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     key = _key(bench, name)
     kept = _kept(path, key) if bench.resume else None
     if kept is not None:
-        bench.say(f"{title}, {nodes} nodes: kept from before")
+        note(f"{title}, {nodes} nodes: kept from before")
         return kept
-    bench.say(f"{title}, {nodes} nodes")
+    note(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings
     job = PipelineInput(
         comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations, order
     )  # fmt: skip
     outcome = run_in_child(
-        bench.pipelines[name].function, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes,
-        say=lambda line: bench.say(f"{title}: {line}"),
-    )  # fmt: skip
+        bench.pipelines[name].function, job, title, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes
+    )
     failure = outcome.failure and outcome.failure.removeprefix(f"{bench.pipelines[name].title}: ")
     attempt = Attempt(key, failure, outcome.notes, None, outcome.reason, list(outcome.crashes))
     if outcome.mesh is not None:
@@ -505,7 +499,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
         except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
             attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}", reason="error")
     if outcome.mesh is None or attempt.failure is not None:
-        bench.say(f"{title}: {attempt.failure}")
+        note(f"{title}: {attempt.failure}")
         return attempt
     mesh_path = path.with_suffix(".vtu")
     fields = cell_fields(outcome.mesh, comparison.image)
@@ -515,7 +509,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     done = PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
     _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     fraction = "none" if measurement.E_D_fraction is None else f"{measurement.E_D_fraction:.4f}"
-    bench.say(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
+    note(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
     # Read back, so that a kept run and a new one are the same: what is not finite is None in both.
     return from_json(Attempt, _read_back(path))
 

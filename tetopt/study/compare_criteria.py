@@ -46,6 +46,13 @@ class CriterionEntry(NamedTuple):
     low: float | None
     high: float | None
 
+    @property
+    def known(self) -> tuple[float, float, float] | None:
+        """Median, lowest and highest, where there are any."""
+        return (
+            None if self.value is None or self.low is None or self.high is None else (self.value, self.low, self.high)
+        )
+
 
 def criteria(report: Report) -> list[Criterion]:
     """The rows of all tables, in order."""

@@ -1,14 +1,21 @@
-"""The comparison as files: `report.json`, the pictures' data and `report.html` made from them."""
+"""The comparison from files to files: `report.json`, the pictures and `report.html` made from it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.io.images import sha256
+from tetopt.job.events import note
+from tetopt.job.inputs import checked_outputs, image_and_labels, label_table
 from tetopt.measure.segmentation import thresholded
 from tetopt.mesh import Mesh
+from tetopt.model.labels import table_of_labels
+from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.study import compare
@@ -23,9 +30,10 @@ from tetopt.study.compare_figures import (
 )
 from tetopt.study.compare_headline import headline
 from tetopt.study.compare_page import save_compare_page
-from tetopt.study.compare_report import Report, as_json
+from tetopt.study.compare_report import ImageSource, LabelSource, Report, as_json
+from tetopt.study.options import CompareOptions
 from tetopt.study.program import pipelines_with
-from tetopt.system.files import save_json
+from tetopt.system.files import results_folder, save_json
 
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {
@@ -46,31 +54,65 @@ COMPARE_PICTURES = {
 COMPARE_FILES = ("report.json", "report.html", *COMPARE_PICTURES)
 
 
-def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say, *, resume: bool = False) -> Report:
-    """Compare, write the files `COMPARE_FILES`, return what `report.json` holds; arguments as `compare.run`.
+def compare_image(
+    image_path: Path, output: Path, options: CompareOptions, command: str, *, resume: bool = False, force: bool = False
+) -> Report:
+    """Compare, write the files `COMPARE_FILES` into a folder, return what `report.json` holds.
+
+    Notes tell what is done; `tetopt.job.events.listened` names who gets them.
+
+    Parameters
+    ----------
+    image_path, output : Path
+    options : CompareOptions
+    command : str
+        What the report says to run it again.
+    resume : bool
+        Keep finished runs of the same image, settings and versions.
+    force : bool
+        Replace the files of an earlier comparison.
 
     Raises
     ------
     InputError
-        Not a volume, labels of another shape, pipelines that do not exist, or every pipeline failed.
+        Options that contradict each other, files that cannot be read or written, not a volume, labels of another
+        shape, pipelines that do not exist, or every pipeline failed.
     """
-    image, settings = comparison.image, comparison.settings
-    if image.ndim != 3:
-        raise InputError(f"compare: expected a volume, got a {image.ndim}-D image")
+    settings = options.settings()
+    image, labels = image_and_labels(image_path, options.labels, options.part)
+    mapping, words = (
+        compare.default_mapping(image) if options.young is None else (parse_mapping(options.young), options.young)
+    )
+    source = ImageSource(image_path.name, sha256(image_path), options.part.volume, options.part.crop)
+    of_labels = _label_source(options.labels, labels, options.label_names)
+    comparison = compare.Comparison(image, labels, mapping, settings, source, of_labels, words, command)
+    paths = checked_outputs(results_folder(output), COMPARE_FILES, force or resume)
+    if (output / "runs").is_dir() and not (resume or force):
+        raise InputError(f"{output / 'runs'}: finished runs are there; `resume` keeps them, `force` starts over")
     names, known = set(settings.pipelines), pipelines_with(settings.programs)
     if not names or not names <= set(known) or len(names) < len(settings.pipelines):
         raise InputError(
             f'pipelines: expected some of {", ".join(known)}, each once, got "{",".join(settings.pipelines)}"'
         )
-    classes = thresholded(image, settings.classes) if comparison.labels is None else comparison.labels
-    report, meshes = compare.run(paths["report.json"].parent, comparison, classes, say, resume=resume)
+    classes = thresholded(image, settings.classes) if labels is None else labels
+    report, meshes = compare.run(output, comparison, classes, resume=resume)
     if not meshes[1]:
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)
         raise InputError(f"compare: every pipeline failed, nothing is reported: {how}")
     save_json(paths["report.json"], as_json(report) | {"headline": as_json(headline(report))})
-    say("pictures and page")
+    note("pictures and page")
     _draw(paths, report, image, meshes)
     return report
+
+
+def _label_source(path: Path | None, labels: Image | None, names: Path | None) -> LabelSource | None:
+    """The labels' file, and what those in it are called; InputError for names of labels that there are not."""
+    if names is not None and labels is None:
+        raise InputError("`label_names`: there are no `labels`")
+    if path is None or labels is None:
+        return None
+    there = table_of_labels(label_table(names), np.unique(labels.data).astype(np.int64).tolist())
+    return LabelSource(path.name, "given", sha256(path), there.names)
 
 
 def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[int, dict[str, Mesh]]) -> None:

@@ -162,17 +162,14 @@ def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
 
 
 def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verdict:
-    if own.value is None or own.low is None or own.high is None:
+    if own.known is None or other.known is None:  # the other is there: a claim is against a mesh with a value
         return "worse"
-    assert other.value is not None, "it was asked for"
-    assert other.low is not None, "there with the value"
-    assert other.high is not None, "there with the value"
-    low, high = own.low, own.high
-    if row.is_timed and low == high and other.value > 0.0:  # of one run: it scatters like the other's, at the least
-        low, high = (own.value * each / other.value for each in (other.low, other.high))
-    is_near = abs(own.value - other.value) <= EQUAL_FRACTION * max(abs(own.value), abs(other.value))
-    best = winners(row.better, [own.value, other.value])
-    if is_near or len(best) != 1 or (low <= other.high and other.low <= high):
+    (value, low, high), (others, lowest, highest) = own.known, other.known
+    if row.is_timed and low == high and others > 0.0:  # of one run: it scatters like the other's, at the least
+        low, high = (value * each / others for each in (lowest, highest))
+    is_near = abs(value - others) <= EQUAL_FRACTION * max(abs(value), abs(others))
+    best = winners(row.better, [value, others])
+    if is_near or len(best) != 1 or (low <= highest and lowest <= high):
         return "no different"
     return "better" if best == [0] else "worse"
 

@@ -35,7 +35,7 @@ from tetopt.start.lattice import lattice_mesh
 
 
 def printed() -> dict[str, Any]:
-    """The numbers that the paper prints, from `paper.toml`."""
+    """The numbers that the paper prints, and what is said of each experiment, from `paper.toml`."""
     return tomllib.loads((files("tetopt.study") / "paper.toml").read_text(encoding="utf-8"))
 
 

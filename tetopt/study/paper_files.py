@@ -15,6 +15,11 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
+from tetopt.io.images import sha256
+from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.job.events import note
+from tetopt.job.inputs import checked_outputs, image_and_labels
+from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
 from tetopt.phantom import load_phantom
@@ -30,7 +35,7 @@ from tetopt.report.scene import (
 from tetopt.report.summary import versions
 from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
-from tetopt.system.files import save_json
+from tetopt.system.files import results_folder, save_json
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)
@@ -42,59 +47,66 @@ CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.j
 ERROR_NAMES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
 
 
-def check_inputs(volume: Image, tissue: Image | None) -> None:
-    """InputError for a volume too small or too plain for the figures, or labels that are none."""
-    if min(volume.shape) < 16 or volume.data.min() == volume.data.max():
-        raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
-    if tissue is not None:
-        check_labels("labels", tissue)
-
-
-def run(
-    paths: dict[str, Path],
-    about: dict[str, Any],
-    volume: Image,
-    tissue: Image | None,
-    seeds: int,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Run every experiment, write the files `PAPER_FILES`, return what `paper.json` holds.
+def reproduce(
+    output: Path, image_path: Path | None, labels_path: Path | None, seeds: int, force: bool = False
+) -> tuple[Path, float]:
+    """Run every experiment, write the files `PAPER_FILES` into a folder; the page, and the seconds that it took.
 
     Parameters
     ----------
-    paths : dict
-        Where each of them goes, by its name.
-    about : dict
-        Names of the files read, for the record.
-    volume : Image
-        A brain MR volume, CSF dark, for Fig. 3(a, b, e, f) and the segmentation.
-    tissue : Image or None
-        Its tissue labels, on the same voxels; without them the segmentation is left out.
+    output : Path
+    image_path : Path or None
+        A brain MR volume, CSF dark, for Fig. 3(a, b, e, f) and the segmentation; None: nilearn's MNI152.
+    labels_path : Path or None
+        Its tissue labels, on the same voxels; None: those of the MNI152, or no section on segmentation.
     seeds : int
         Number of random meshes for Fig. 1.
-    say : callable
-        Called with a line on each thing that is done.
+    force : bool
+        Replace the files of an earlier run.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or written, or a volume too small or too plain for the figures.
     """
+    if seeds < 1:
+        raise InputError(f"`seeds`: expected 1 or more, got {seeds}")
+    source = mni_path("t1") if image_path is None else image_path
+    volume, tissue = image_and_labels(source, labels_path, WHOLE_BOX)
+    labels_name = None if labels_path is None else labels_path.name
+    if image_path is None and labels_path is None:
+        tissue, labels_name = mni_tissue(), "MNI152 tissue"
+    if min(volume.shape) < 16 or volume.data.min() == volume.data.max():
+        raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
+    if tissue is None:
+        note("no `labels`: the section on approximate segmentation is left out")
+    else:
+        check_labels("labels", tissue)
+    paths = checked_outputs(results_folder(output), PAPER_FILES, force)
+    about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     begin = time.perf_counter()
-    steps: list[tuple[str, Callable[[], dict[str, Any]]]] = [
-        ("Fig. 1: random nodes", lambda: _figure_1(paths, seeds)),
-        ("Fig. 2: synthetic phantom", lambda: _figure_2(paths)),
-        ("Fig. 2(b): energy of one node", lambda: _figure_2b(paths)),
-        ("Fig. 3(a, b): brain MR slice", lambda: _figure_3ab(paths, volume)),
-        ("Fig. 3(c, d): prostate elastography", lambda: _figure_3cd(paths)),
-        ("Fig. 3(e, f): brain MR volume", lambda: _figure_3ef(paths, volume)),
-    ]
+    steps: dict[str, Callable[[], dict[str, Any]]] = {
+        "fig1": lambda: _figure_1(paths, seeds), "fig2": lambda: _figure_2(paths), "fig2b": lambda: _figure_2b(paths),
+        "fig3ab": lambda: _figure_3ab(paths, volume), "fig3cd": lambda: _figure_3cd(paths),
+        "fig3ef": lambda: _figure_3ef(paths, volume),
+    }  # fmt: skip
     if tissue is not None:
-        steps.append(("Section 5: approximate segmentation", lambda: _segmentation(volume, tissue)))
+        steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
-    for title, step in steps:
-        say(title)
-        sections.append({"title": title, **step()})
+    for name, step in steps.items():
+        note(paper.printed()["sections"][name]["title"])
+        sections.append(step())
     seconds = time.perf_counter() - begin
     results = about | {"seeds": seeds, "versions": versions(), "seconds": seconds, "sections": sections}
     save_json(paths["paper.json"], results)
     _write_page(paths, results)
-    return results
+    return paths["paper.html"], seconds
+
+
+def _section(name: str, **values: float) -> dict[str, Any]:
+    """Title and text of an experiment, with these numbers in it."""
+    said = paper.printed()["sections"][name]
+    return {"title": said["title"], "text": said["text"].format(**values)}
 
 
 def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
@@ -118,15 +130,7 @@ def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
     for name, errors in spread.items():
         low, middle, high = np.percentile(errors, [5, 50, 95], axis=0)
         rows.append(_row(name, middle[:4], middle[4]) | {"p5": low, "p95": high})
-    text = (
-        f"The paper shows one set of 61 random nodes and does not say how it was drawn; ours are medians of {seeds} "
-        "seeds, 24 nodes even on the boundary and 37 uniform inside; the picture is of seed 0. The harmonic mean (ii) "
-        "is far lower than printed, since a cell that comes out almost equilateral pulls it towards 0. It seems that "
-        "the paper printed geometric means: row 6 is of two kinds of triangles, so its (i), (iii) and (iv) fix their "
-        "errors, 0.0922 and 0.0795, whose harmonic mean is 0.0854 and geometric mean 0.0856, as printed. So each (ii) "
-        "stands here both ways."
-    )
-    return {"text": text, "errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
+    return _section("fig1", seeds=seeds) | {"errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
 
 
 def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
@@ -144,14 +148,8 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     }
     worst = cases[1].result.mesh
     flat = np.sort((0.5 - rho(worst.points, worst.cells)) ** 2)[-2:]
-    text = (
-        "Row 3 of Table 1 is set by the mesh alone and comes out to the printed digits. The phantom's shapes and the "
-        "number of iterations are not printed; ours are fig2_2d and 20. With k_D = 0.3 (iii) and (iv) come out higher "
-        f"than printed because of the two worst triangles, at the rim of our disc: {flat.sum():.2f} of the sum (iii) "
-        "is theirs; the paper's mode has no bound on shape."
-    )
-    return {
-        "text": text, "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
+    return _section("fig2", flat=flat.sum()) | {
+        "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
         "E_D_relative": {case.title: _E_D_relative(case) for case in cases},
         "pictures": [["fig2.png", "Fig. 2(a, c, d): mesh over the phantom, and the mean in each cell"]],
     }  # fmt: skip
@@ -170,13 +168,7 @@ def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
     landscapes = [paper.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
     save_figure(landscape_figure(landscapes), paths["fig2b.png"])
     minima = [{"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes]
-    text = (
-        "E over the place of the centre node of four triangles. As k_D grows the minimum leaves the middle for the "
-        "edge in the image. The descent starts in the middle and moves along the axes; it ends where no move along "
-        "either axis lowers E, which in a valley oblique to both (k_D = 0.8) need not be a minimum. Between the "
-        "grid's places it may end a little below the lowest of them (k_D = 0.05)."
-    )
-    return {"text": text, "minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
+    return _section("fig2b") | {"minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
 
 
 def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
@@ -184,12 +176,8 @@ def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     save_figure(
         slice_figure(case.image, [("initial", case.initial), ("k_D = 0.2", case.result.mesh)]), paths["fig3ab.png"]
     )
-    text = (
-        "The paper's slice is not published; this one is axial, at 47 % of the volume's height, which on the MNI152 "
-        "brain passes through the ventricles."
-    )
-    return {
-        "text": text, "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
+    return _section("fig3ab") | {
+        "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
         "pictures": [["fig3ab.png", "Fig. 3(a, b): 128 nodes, before and after 20 iterations"]],
     }  # fmt: skip
 
@@ -207,17 +195,8 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         before, after = (_simulated(case.image, mesh) for mesh in (case.initial, case.result.mesh))
         change = {name: after[name] / before[name] - 1.0 for name in after}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
-    text = (
-        "The elastography data are not published. A phantom, prostate_2d, is compressed by our plane-stress solve, "
-        "its axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those of "
-        "squares: (i), (iii) and (iv) are those of a box 2.2 % longer than wide. The largest eigenvalue and with it "
-        "the condition number are set by a few triangles in the stiffest nodule, so they hang on how the mesh happens "
-        "to cut it, and range widely over the noise levels; the paper's condition number rises less than any of ours. "
-        "The strain energy depends on how much of the box the stiff parts fill and on the modulus of the rest, which "
-        "the paper does not print; why its change is five times ours we cannot tell."
-    )
-    return {
-        "text": text, "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
+    return _section("fig3cd") | {
+        "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
         "printed_change": paper.printed()["change"],
         "pictures": [["fig3cd.png", "Fig. 3(c, d): approximate modulus, SNR 30 dB, before and after 15 iterations"]],
     }  # fmt: skip
@@ -233,14 +212,8 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     save_scenes(paths["fig3e.png"], [*scenes, ("surface from the voxels", isosurface_before_slices(image, surface))])
     shown = [("initial mesh", initial, before), ("optimised mesh", mesh, after)]
     save_scenes(paths["fig3f.png"], [(title, structure_before_slices(image, m, cells)) for title, m, cells in shown])
-    text = (
-        "The paper's volume is not published. Fig. 3(f) is the largest connected set of tetrahedra of mean below a "
-        f"threshold; here {below:.0f}, 0.6 x the median of the brighter voxels, which in the optimised mesh of the "
-        "MNI152 T1 gives the lateral ventricles. Beside the slices in Fig. 3(e) stands the isosurface of the voxels "
-        "at the same threshold, freed of the sulci by an erosion of one voxel."
-    )
-    return {
-        "text": text, "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+    return _section("fig3ef", below=below) | {
+        "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
         "structure": {"below": below, "n_cells_initial": len(before), "n_cells": len(after)},
         "pictures": [
             ["fig3e.png", "Fig. 3(e): slices embedded in the initial mesh, of which the lower part is drawn; surface"],
@@ -261,15 +234,9 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
         )
     }
     ratio = volume.data.size / len(case.initial.cells)
-    text = (
-        "Section 5 proposes an optimised mesh as a fast approximate segmentation and prints no numbers. Cells are "
-        "grouped by their means into K classes and painted back to the voxels; each class stands for the tissue that "
-        "most of its voxels carry, and a tissue for which no class stands has Dice 0. Beside it the same classes from "
-        f"the voxels themselves, which have {ratio:.0f} times as many values. The mesh has {len(case.initial.points)} "
-        "nodes. Labels of the MNI152: 0 background, 1 CSF, 2 grey, 3 white matter. Tissue thinner than a cell, as the "
-        "CSF round the brain, is out of reach."
-    )
-    return {"text": text, "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)}}
+    return _section("segmentation", ratio=ratio, nodes=len(case.initial.points)) | {
+        "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+    }  # fmt: skip
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
@@ -279,16 +246,10 @@ def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
         pictures = [(folder / name, caption) for name, caption in section.get("pictures", ())]
         tables = [_lines(section), _minima_lines(section), _dice_lines(section)]
         pages.append({"title": section["title"], "text": section["text"], "pictures": pictures, "tables": tables})
-    intro = (
-        "O. Goksel and S. E. Salcudean, High-Quality Model Generation for Finite Element Simulation of Tissue "
-        f"Deformation: each printed number beside tetopt's ({results['versions']['tetopt']}), run on "
-        f"{results['image']}. Errors are of the radius ratio rho = inradius / circumradius, 1/2 on an equilateral "
-        "triangle and 1/3 on a regular tetrahedron: (i) mean, (ii) harmonic mean, (iii) sum of squares and (iv) "
-        "maximum of 1/n - rho, n the dimension; smaller is better. E_G is the shape energy, Eq. (1), E_D the image "
-        "energy, Eq. (3), k_D its weight in E, Eq. (4)."
-    )
+    words = paper.printed()["page"]
+    intro = words["intro"].format(version=results["versions"]["tetopt"], image=results["image"])
     if not any(section.get("dice") and "Section 5" in section["title"] for section in results["sections"]):
-        intro += " Section 5, segmentation, is left out: no tissue labels were given."
+        intro += words["no_labels"]
     pages.insert(0, {"title": "What this is", "text": intro})
     save_page(paths["paper.html"], "The paper's figures and table, reproduced", pages)
 

@@ -8,6 +8,7 @@ from typing import Any
 from tetopt.engine.loop import GRADED_K_D, QUADRATIC_GRADATION, QUADRATIC_RATIO, SHAPE_POWER
 from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
+from tetopt.job.events import note
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import COARSEST_RATIO, Sizes
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
@@ -29,9 +30,7 @@ SWEPT_OPTIONS: tuple[SweptOption, ...] = (
 )  # fmt: skip
 
 
-def tradeoff(
-    image: Image, nodes: int, order: int, measure: Callable[[Mesh, int], Measurement], say: Callable[[str], None]
-) -> list[TradeoffRow]:
+def tradeoff(image: Image, nodes: int, order: int, measure: Callable[[Mesh, int], Measurement]) -> list[TradeoffRow]:
     """Meshes over `SWEPT_OPTIONS` whose cells of this order have about `nodes` nodes in all, each with its measurement.
 
     The default's mesh is made once.
@@ -42,7 +41,7 @@ def tradeoff(
         for value in values[order]:
             changed = None if value == defaults[order] else (option, value)
             if changed not in measurements:
-                say(f"trade-off, {ORDER_WORDS[order]} cells: {option} = {value:g}")
+                note(f"trade-off, {ORDER_WORDS[order]} cells: {option} = {value:g}")
                 mesh = mesh_image(image, nodes, order=order, **arguments(value)).mesh
                 measurements[changed] = measure(mesh, order)
             rows.append(TradeoffRow(order, option, value, changed is None, measurements[changed]))
