@@ -15,13 +15,13 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import tetopt
 from tetopt.errors import InputError
+from tetopt.system import work_directory
 from tetopt.system.files import save_json
 from tetopt.system.incoming import irregular, json_of, own_bytes, text_of
 from tetopt.system.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check_files, create, opened
@@ -157,25 +157,9 @@ def description(name: str, sources: list[str]) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
-    """Within it no other run writes to the folder, or, with `keys`, none that writes the whole or these subjects.
-
-    A lock ends with its process, also one that is killed.
-
-    Raises
-    ------
-    InputError
-        Another run has the lock; the work directory holds what is not tetopt's.
-    """
-    create(out / WORK_NAME, WORK)
-    with ExitStack() as stack:
-        work = stack.enter_context(opened(out / WORK_NAME, WORK))
-        work.check()
-        work.lock(stack, LOCK_NAME, is_shared=keys is not None, what=str(out))
-        for key in keys or ():
-            work.lock(stack, f"{key}.lock", is_shared=False, what=f"{out}: {key}")
-        yield
+def locked(out: Path, keys: list[str] | None = None) -> AbstractContextManager[None]:
+    """Within it no other run writes to the folder, or, with `keys`, none that writes the whole or these subjects."""
+    return work_directory.locked(out / WORK_NAME, WORK, out, keys)
 
 
 def publish(work: Path, out: Path, key: str) -> None:

@@ -20,7 +20,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,9 +32,10 @@ from tetopt.image import Image
 from tetopt.io.images import Bounds
 from tetopt.io.stored_images import open_stored, stored_checksum
 from tetopt.io.text import plain
+from tetopt.system import work_directory
 from tetopt.system.files import save_json, written_whole
 from tetopt.system.incoming import json_of, own_bytes
-from tetopt.system.work_directory import LOCK_NAME, Layout, create, discard, opened
+from tetopt.system.work_directory import LOCK_NAME, Layout, create, discard
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
 LOGS_NAME = "logs"
@@ -67,21 +68,9 @@ class VolumeFile(NamedTuple):
             return open_stored(self.path, volume=self.volume, crop=self.crop)
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """The work directory, created if it is not there, for one run alone.
-
-    Raises
-    ------
-    InputError
-        Another run has it, or it holds what is not tetopt's.
-    """
-    create(folder, LAYOUT)
-    with ExitStack() as stack:
-        work = stack.enter_context(opened(folder, LAYOUT))
-        work.check()
-        work.lock(stack, LOCK_NAME, is_shared=False, what=str(folder))
-        yield
+def locked(folder: Path) -> AbstractContextManager[None]:
+    """The work directory, for one run alone; see `tetopt.system.work_directory.locked`."""
+    return work_directory.locked(folder, LAYOUT, folder)
 
 
 def removed(folder: Path) -> list[str]:

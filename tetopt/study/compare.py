@@ -13,7 +13,6 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
@@ -72,7 +71,7 @@ from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
 from tetopt.system.files import save_json
 from tetopt.system.incoming import own_bytes, text_of
-from tetopt.system.work_directory import LOCK_NAME, Layout, create, opened
+from tetopt.system.work_directory import LOCK_NAME, Layout, locked
 
 Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its settings, as JSON has it
 # Settings that no finished run's numbers depend on: what else is compared, and limits that a finished run kept to. Its
@@ -324,11 +323,7 @@ def run(
     if resume:
         _check_resumable(folder, comparison)
     runs = folder / RUNS_NAME
-    create(runs, RUNS)
-    with ExitStack() as stack:
-        work = stack.enter_context(opened(runs, RUNS))
-        work.check()
-        work.lock(stack, LOCK_NAME, is_shared=False, what=str(runs))
+    with locked(runs, RUNS, runs):
         return _run(runs, comparison, classes, resume=resume)
 
 

@@ -14,7 +14,7 @@ import re
 import shutil
 import socket
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -117,13 +117,7 @@ class WorkDirectory(NamedTuple):
         return str(self.path / name) if self.descriptor is None else name
 
     def lock(self, stack: ExitStack, name: str, *, is_shared: bool, what: str) -> None:
-        """Take the lock of a file until the stack is unwound, or the process ends; its owner stands in the file.
-
-        Raises
-        ------
-        InputError
-            Another run has it, which is said of `what`; the file has a second name, under which it would be changed.
-        """
+        """Take the lock of a file until the stack is unwound, or the process ends; its owner stands in the file."""
         if not HAS_LOCKS:
             return
         handle = os.open(self._place(name), os.O_RDWR | os.O_CREAT | UNFOLLOWED, 0o600, dir_fd=self.descriptor)
@@ -149,6 +143,28 @@ def create(path: Path, layout: Layout) -> None:
         if work.is_new():
             os.chmod(path if work.descriptor is None else work.descriptor, 0o700)
             save_json(path / MANIFEST_NAME, layout._asdict())
+
+
+@contextmanager
+def locked(path: Path, layout: Layout, what: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
+    """A work directory, created if it is not there, for one run alone; with `keys` beside runs of other keys.
+
+    A lock ends with its process, also one that is killed.
+
+    Raises
+    ------
+    InputError
+        Another run has it, or one of the keys, which is said of `what`; it holds what is not tetopt's, or a lock that
+        has a second name, under which it would be changed.
+    """
+    create(path, layout)
+    with ExitStack() as stack:
+        work = stack.enter_context(opened(path, layout))
+        work.check()
+        work.lock(stack, LOCK_NAME, is_shared=keys is not None, what=str(what))
+        for key in keys or ():
+            work.lock(stack, f"{key}.lock", is_shared=False, what=f"{what}: {key}")
+        yield
 
 
 @contextmanager
