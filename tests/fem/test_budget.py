@@ -27,7 +27,7 @@ def test_time_and_iterations_set_the_size(monkeypatch):
     image = image_of((40, 30, 35))
     whole = 3 * 41 * 31 * 36
     monkeypatch.setattr(budget, "seconds_of_iteration", lambda grid: 1e-6)
-    monkeypatch.setattr(budget, "available_bytes", lambda: None)
+    monkeypatch.setattr(budget, "available_bytes", lambda: 10**15)
     one, two = (affordable_dofs(image, nus, 1.0).dofs for nus in ((0.3,), (0.3, 0.45)))
     assert 1_000 < two < 0.6 * one < whole
     assert affordable_dofs(image, (0.3,), 0.5).dofs == pytest.approx(one / 2, abs=1)

@@ -25,6 +25,16 @@ def balls(shape, affine=None, seed=3):
     return tetopt.Image(data + np.random.default_rng(seed).integers(0, 9, shape), affine)
 
 
+def shared_nodes(mesh):
+    """Nodes of more than one part, (N,)."""
+    first = np.full(len(mesh.ticks), -1, dtype=np.int64)
+    first[mesh.cells.ravel()] = np.repeat(mesh.part, mesh.cells.shape[1])
+    is_shared = np.zeros(len(mesh.ticks), dtype=bool)
+    other = first[mesh.cells] != mesh.part[:, None]
+    is_shared[mesh.cells[other]] = True
+    return is_shared
+
+
 class Recorded(NamedTuple):
     """What went into a part, and what came of it."""
 

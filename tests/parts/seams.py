@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from parted import recorded_run, request
+from parted import recorded_run, request, shared_nodes
 
 import tetopt
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.meshing import mesh_image
 from tetopt.geometry.simplex import rho
-from tetopt.parts.cut import ROUND_SHIFTS, Shared, counts_of, cut, joined, shared_nodes
+from tetopt.parts.cut import ROUND_SHIFTS, Shared, counts_of, cut, joined
 from tetopt.parts.part import PartSettings
 from tetopt.parts.rounds import _weights
 

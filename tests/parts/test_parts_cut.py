@@ -5,9 +5,10 @@ from collections import Counter
 import numpy as np
 import pytest
 from meshes import delaunay_box
+from parted import shared_nodes
 
 from tetopt.geometry.simplex import volumes
-from tetopt.parts.cut import ROUND_SHIFTS, Shared, counts_of, cut, joined, pieces, shared_nodes
+from tetopt.parts.cut import ROUND_SHIFTS, Shared, counts_of, cut, joined, pieces
 
 PLACES = np.random.default_rng(5).uniform(0.0, 30.0, (4000, 3)) ** [1.0, 1.5, 1.0]
 EVEN = np.ones(len(PLACES))

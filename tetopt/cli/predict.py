@@ -29,7 +29,7 @@ def print_prediction(task: Task) -> None:
     if task.plan.job.target_error is not None:
         out.print(f"of {size.runs} runs with {size.n_nodes} nodes: how many an error takes shows only in the run")
     free = available_bytes()
-    if free is not None and n_bytes > free:
+    if n_bytes > free:
         show_warning(f"{memory_words(free)} of memory are free, less than this run takes; ask for fewer nodes, or crop")
 
 
@@ -49,7 +49,7 @@ def print_parts(task: Task) -> None:
         "made in one piece"
     )
     free = available_bytes()
-    if free is not None and own > free:
+    if own > free:
         show_warning(f"{memory_words(free)} of memory are free, less than the octree takes; ask for fewer nodes")
     if job.worker_gb is not None and job.worker_gb * BYTES_PER_GB < need.limit_for(n_bytes):
         show_warning(f"--worker-gb {job.worker_gb:g}: less than a worker takes; give more, or ask for more --parts")

@@ -78,7 +78,7 @@ def _read_size(entry: PlannedSubject) -> RunSize | None:
 def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
     """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
     sizes = [each.peak_bytes for each in estimate.each.values()]
-    free = available_bytes()
-    if free is not None and cohort.scheduler is None and cohort.cluster is None:
+    if cohort.scheduler is None and cohort.cluster is None:
+        free = available_bytes()
         sizes = [each for each in sizes if each <= free]
     return Need(n_tasks, max(sizes, default=0.0), threads)

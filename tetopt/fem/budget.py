@@ -72,9 +72,8 @@ def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percen
     iterations = sum(reference(trial, nu, percent).work.iterations for nu in nus)
     timed = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TIMED_DOFS))
     in_time = seconds / (SOLUTION_RATIO * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
-    free = available_bytes()
     # The references stay, all of them, with two fields each.
-    in_memory = np.inf if free is None else FREE_FRACTION * free / (DOF_BYTES + 16.0 * (len(nus) - 1))
+    in_memory = FREE_FRACTION * available_bytes() / (DOF_BYTES + 16.0 * (len(nus) - 1))
     return Budget(max(LEAST_DOFS, int(min(in_time, in_memory, whole))), bool(in_memory < min(in_time, whole)))
 
 

@@ -63,21 +63,19 @@ def with_parts(plan: Plan) -> Plan:
     InputError
         Options that parts do not have, or that only they have; dask not installed.
     """
-    job = plan.job
-    names = [field.name for field in dataclasses.fields(PartsOptions) if getattr(job, field.name) is not None]
-    needed, free = _whole_bytes(plan), available_bytes()
-    is_too_large = needed is not None and free is not None and needed > free
-    is_chosen = is_too_large and job.parts is None and _unsupported_option(plan) is None
-    if job.parts is None and not is_chosen:
-        if names:
-            note(f"`{names[0]}`: has no say, as the mesh is made in one piece; `parts` asks for parts")
-        return plan
-    if is_chosen and needed is not None and free is not None:
+    job, unsupported = plan.job, _unsupported_option(plan)
+    if job.parts is None:
+        needed, free = _whole_bytes(plan), available_bytes()
+        if needed <= free or unsupported is not None:
+            names = (field.name for field in dataclasses.fields(PartsOptions) if getattr(job, field.name) is not None)
+            if (name := next(names, None)) is not None:
+                note(f"`{name}`: has no say, as the mesh is made in one piece; `parts` asks for parts")
+            return plan
         note(
             f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
             "in parts"
         )
-    elif (unsupported := _unsupported_option(plan)) is not None:
+    elif unsupported is not None:
         raise InputError(unsupported)
     if job.worker_gb is not None and not job.worker_gb > 0.0:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
@@ -92,12 +90,12 @@ def _is_storable(path: Path) -> bool:
     return path.name.lower().endswith(STORED_SUFFIXES)
 
 
-def _whole_bytes(plan: Plan) -> float | None:
-    """What a graded mesh of an image that could be left in its file takes in one piece; None of others."""
+def _whole_bytes(plan: Plan) -> float:
+    """What a graded mesh of an image that could be left in its file takes in one piece; 0 of others."""
     path = plan.job.images[0]
     check_local(path)
     if not _is_storable(path) or plan.job.slice_ is not None or plan.mode != "graded":
-        return None
+        return 0.0
     n_voxels = _n_voxels(plan)
     nodes = plan.job.nodes or DEFAULT_NODES[3]
     return VOXEL_BYTES * n_voxels + meshing_bytes(n_voxels, len(plan.job.images), nodes)
@@ -130,8 +128,7 @@ def _is_left(plan: Plan) -> bool:
     """Whether the image of a run in parts is left in its file: a large one, or one that does not fit into memory."""
     if not _is_storable(plan.job.images[0]):
         return False
-    needed, free = _whole_bytes(plan), available_bytes()
-    return _n_voxels(plan) > MOST_LOADED or (needed is not None and free is not None and needed > free)
+    return _n_voxels(plan) > MOST_LOADED or _whole_bytes(plan) > available_bytes()
 
 
 def left_source(plan: Plan) -> Source | None:

@@ -95,16 +95,6 @@ def pieces(mesh: Shared) -> list[Piece]:
     return result
 
 
-def shared_nodes(mesh: Shared) -> NDArray[np.bool_]:
-    """Nodes of more than one part, (N,)."""
-    first = np.full(len(mesh.ticks), -1, dtype=np.int64)
-    first[mesh.cells.ravel()] = np.repeat(mesh.part, mesh.cells.shape[1])
-    is_shared = np.zeros(len(mesh.ticks), dtype=bool)
-    other = first[mesh.cells] != mesh.part[:, None]
-    is_shared[mesh.cells[other]] = True
-    return is_shared
-
-
 def joined(ticks: Sequence[NDArray[np.int64]], cells: Sequence[NDArray[np.int64]]) -> Shared:
     """Parts put together: nodes in the same place, which parts share, become one.
 
