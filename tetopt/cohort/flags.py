@@ -70,11 +70,19 @@ GRID_COLUMNS = {
     "grid.orientation": "orientation", "grid.spacing_mm": "voxels in mm", "grid.shape": "voxels along the axes",
     "versions.tetopt": "version of tetopt",
 }  # fmt: skip
-
 TURN_WORDS = {
     "thumbnail.left_right": "left and right exchanged", "thumbnail.back_front": "back and front exchanged",
     "thumbnail.upside_down": "up and down exchanged",
 }  # fmt: skip
+
+
+def label_quantities(number: int, names: dict[int, str]) -> tuple[Quantity, Quantity]:
+    """Volume and Dice of a label."""
+    words = label_words(number, names)
+    return (
+        Quantity(f"labels.{number}.volume", f"volume of label {words}", "mm", "both", True, 0.05),
+        Quantity(f"labels.{number}.dice", f"Dice of label {words}", "", "below", False, 0.02),
+    )
 
 
 def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
@@ -251,10 +259,7 @@ def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:
         yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
     numbers = sorted({number for row in rows for number in row.volumes if number > 0})
     for number in numbers:
-        words = label_words(number, names)
-        volume = Quantity(f"labels.{number}.volume", f"volume of label {words}", "mm", "both", True, 0.05)
-        dice = Quantity(f"labels.{number}.dice", f"Dice of label {words}", "", "below", False, 0.02)
-        for quantity in (volume, dice):
+        for quantity in label_quantities(number, names):
             yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
 
 

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units, unjudged
+from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, label_quantities, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
 from tetopt.errors import InputError
-from tetopt.model.labels import label_words
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
 from tetopt.system.incoming import own_bytes
 
@@ -189,14 +188,7 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
     names = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
     room = max(PAGE_NUMBERS // max(len(rows), 1) - len(shown), 0) // 2
     labels = sorted(number for number, _ in counts.most_common(room))
-    for number in labels:
-        words = label_words(number, names)
-        shown[f"labels.{number}.volume"] = Quantity(
-            f"labels.{number}.volume", f"volume of label {words}", "mm", "both", True, 0.0
-        )
-        shown[f"labels.{number}.dice"] = Quantity(
-            f"labels.{number}.dice", f"Dice of label {words}", "", "below", False, 0.0
-        )
+    shown |= {each.column: each for number in labels for each in label_quantities(number, names)}
     return shown, len(counts) - len(labels)
 
 
