@@ -400,7 +400,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
 
 def test_a_cohort_from_python_is_that_of_the_command(small):
     """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
-    rows = tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, count=1, iterations=1)
+    rows = tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, workers=1, iterations=1)
     assert rows == {"sub-01": "done", "sub-02": "done"}
     assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--iterations", "1", "--dry-run") == 0
     events = []

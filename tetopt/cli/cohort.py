@@ -67,7 +67,7 @@ def _say_estimate(plan: CohortPlan) -> None:
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
         out.print(f"{whole}; divided by as many as the cluster runs at a time" if to_run else "nothing to run")
         return
-    n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.count).workers
+    n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
     seconds = time_words(estimate.seconds() / n_workers)
     out.print(f"{whole}; on this machine {n_workers} at a time: about {seconds}")
 

@@ -96,13 +96,13 @@ def run_cohort(
         Gets each `Event`; without one warnings are Python's warnings.
     **options
         Of all subjects, those of a `Job` but images, outputs and parts; and of the cohort: `suffix`, `participants`,
-        `sessions`, `mesh_format`, `write_table`, `dry_run`, `retry_failed`, `collect`, `count` (of workers),
+        `sessions`, `mesh_format`, `write_table`, `dry_run`, `retry_failed`, `collect`, `workers`,
         `scheduler`, `cluster`.
 
     Returns
     -------
     dict
-        By subject, as "sub-01_ses-a", what there is now: "done", "violated" (a mesh that misses a requirement),
+        By subject, as "sub-01_ses-a", what there is now: "done", "violated" (a mesh that violates a requirement),
         "failed" or "missing".
 
     Raises
@@ -145,7 +145,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     InputError
         Options that cannot be; `Problems` for all that is wrong with the subjects.
     """
-    check_choice(cohort.count, cohort.scheduler, cohort.cluster, "cohort")
+    check_choice(cohort.workers, cohort.scheduler, cohort.cluster, "cohort")
     suffix = checked_suffix(cohort.mesh_format)
     place = cohort.output
     if options.threads is not None and options.threads < 1:
@@ -177,7 +177,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
 def _tell_plan(plan: CohortPlan) -> None:
     """How many subjects there are of each kind, and why the ones are run that are there already."""
     counts = Counter[str](entry.state.status for entry in plan.entries)
-    words = {"done": "done", "violated": "done, but violates a requirement", "failed": "failed", "changed": "changed"}
+    words = {"done": "done", "violated": "with a violated requirement", "failed": "failed", "changed": "changed"}
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
     parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
     note(f"{counted(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run")
@@ -228,7 +228,7 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
         with workers(
             need,
             Folders(work, place / LOGS_NAME),
-            count=cohort.count,
+            count=cohort.workers,
             scheduler=cohort.scheduler,
             cluster=cohort.cluster,
         ) as pool:

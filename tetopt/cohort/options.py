@@ -32,8 +32,8 @@ class CohortOptions:
     dry_run: Annotated[bool, Option(None, "Tell what would be run, why, and what it takes; run nothing.")] = False
     retry_failed: Annotated[bool, Option(None, "Run only those that failed; what has changed stays as it is.")] = False
     collect: Annotated[bool, Option(None, "Write the table and the page of what is there; run nothing.")] = False
-    count: Annotated[
-        int | None, Option("N", "So many subjects at a time, or jobs of a `cluster`, at most.", "workers", least=1)
+    workers: Annotated[
+        int | None, Option("N", "So many subjects at a time, or jobs of a `cluster`, at most.", least=1)
     ] = None
     scheduler: SchedulerOption = None
     cluster: ClusterOption = None
