@@ -59,7 +59,7 @@ def test_what_background_leaves_is_no_mask(said):
         "mask": words
     }
     text = said()
-    assert "mask" not in text
+    assert "the mask" not in text
     assert text.count("foreground") >= text.count("\n") == 5
 
 
