@@ -76,6 +76,18 @@ def test_the_whole_is_read_when_it_is_asked_for(monkeypatch):
     assert (stored.is_stored, stored.in_memory, voxels.n_reads) == (False, stored, 1)
 
 
+def test_what_has_been_read_as_a_whole_is_not_read_again():
+    voxels = Counted(ramp(4, 5, 6))
+    image = Image.stored(voxels)
+    whole = image.data
+    assert voxels.n_reads == 1
+    assert np.shares_memory(image.read((0, 0, 0), (2, 2, 2)), whole)
+    assert image.box((1, 1, 1), (4, 5, 6)).data.tolist() == whole[1:, 1:, 1:].tolist()
+    del voxels.data  # as of a file that was closed
+    assert image.shape == (4, 5, 6)
+    assert "4 x 5 x 6 voxels" in repr(image)
+
+
 def test_the_whole_of_what_no_image_takes_is_refused():
     with pytest.raises(InputError, match=r"1 voxels are NaN or infinite, the first at index \(0, 1, 0\)"):
         _ = Image.stored(np.array([[[1.0], [np.nan]]])).data

@@ -121,6 +121,11 @@ class Image:
         return "data" not in vars(self)
 
     @property
+    def _readable(self) -> Any:
+        """What boxes are read from: the voxels in memory, once they are there."""
+        return vars(self).get("data", self.voxels)
+
+    @property
     def in_memory(self) -> Image | None:
         """The image itself, unless its voxels are only stored."""
         return None if self.is_stored else self
@@ -128,7 +133,7 @@ class Image:
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
-        return tuple(int(size) for size in self.voxels.shape)
+        return tuple(int(size) for size in self._readable.shape)
 
     @property
     def ndim(self) -> int:
@@ -213,7 +218,7 @@ class Image:
         >>> stored.read((0, 0, 0), (1, 2, 4)).tolist()
         [[[0, 1, 2, 3], [4, 5, 6, 7]]]
         """
-        return np.asarray(self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
+        return np.asarray(self._readable[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
         """The voxels of a box of indices as an image in memory; every voxel keeps its place in the world.
@@ -287,7 +292,7 @@ class Image:
 
     def __repr__(self) -> str:
         values = "stored" if self.is_stored else f"{self.data.min():.4g} to {self.data.max():.4g}"
-        return f"Image({self._size()}, {self.voxels.dtype}, {values})"
+        return f"Image({self._size()}, {self._readable.dtype}, {values})"
 
     def _size(self) -> str:
         """Number and size of voxels."""
@@ -296,7 +301,7 @@ class Image:
 
     def _repr_html_(self) -> str:
         """Numbers and the middle slice, for a notebook; of a stored image neither intensities nor a picture."""
-        rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
+        rows = [("size", self._size()), ("kind", str(self._readable.dtype))]
         if self.is_stored:
             return notebook.card_html("Image", rows, "")
         low, high, mean = self.data.min(), self.data.max(), self.data.mean(dtype=np.float64)

@@ -51,6 +51,13 @@ def test_what_cannot_be_is_refused_by_name(options, words):
     assert len(str(caught.value)) < 600
 
 
+def test_numbers_of_numpy_are_texts_that_are_read_back_to_the_last_bit():
+    names = {"images": ["a.nii", "b.nii"], "output": "a.vtu"}
+    job = Job(**names, young=np.float64(3.5), bins=np.int64(4), background=np.float32(0.1), weights=[2, 2 / 3])
+    assert (job.young, job.bins, float(job.background)) == ("3.5", "4", float(np.float32(0.1)))
+    assert [float(each) for each in job.weights.split(",")] == [2.0, 2 / 3]
+
+
 def test_json_gives_the_job_back():
     job = Job(
         images=["a.nii", "b.nii"], output="a.inp", weights=[1, 0.5], loads=["compress:5%", "hold:left"], young="1 + h",

@@ -9,6 +9,7 @@ from models import sample_image
 
 import tetopt
 from tetopt.io.formats import FORMATS
+from tetopt.job.events import listened, note
 
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
 OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
@@ -132,6 +133,32 @@ def test_a_run_writes_every_format_as_the_command_does(inputs, tmp_path, monkeyp
     options = {"iterations": 0, **OF_FORMAT.get(suffix, {})}
     both(inputs, tmp_path, monkeypatch, "a.nii.gz", options, f"x{suffix}")
     assert_equal_files(tmp_path)
+
+
+def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_events(inputs, tmp_path):
+    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "w.vtu", nodes=60, iterations=1, min_dihedral=65)
+    with pytest.warns(UserWarning, match="requirement violated: min_dihedral: "):
+        assert "min_dihedral" in tetopt.run(job).violated
+    events = []
+    with listened(events.append):
+        note("one")
+        with listened(None):
+            note("two")
+    assert [event.text for event in events] == ["one", "two"]
+
+
+def test_an_input_is_no_output_and_a_refused_run_leaves_no_folder(inputs, tmp_path):
+    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "x.vtu", nodes=60, iterations=0)
+    tetopt.run(job)
+    before = (tmp_path / "x.vtu").read_bytes()
+    with pytest.raises(tetopt.InputError, match="is an input of this command too"):
+        tetopt.run(
+            tetopt.Job(images=inputs / "a.nii.gz", start=tmp_path / "x.vtu", output=tmp_path / "x.vtu", force=True)
+        )
+    assert (tmp_path / "x.vtu").read_bytes() == before
+    with pytest.raises(tetopt.InputError, match="no such file"):
+        tetopt.run(tetopt.Job(images=tmp_path / "no.nii", output=tmp_path / "y.vtu", figures=tmp_path / "pictures"))
+    assert not (tmp_path / "pictures").exists()
 
 
 def test_the_library_prints_nothing(inputs, tmp_path, capfd):

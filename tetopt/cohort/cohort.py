@@ -114,6 +114,10 @@ def run_cohort(
     --------
     run : One of them.
 
+    Notes
+    -----
+    Workers are processes that begin by importing your program: let it call this under ``if __name__ == "__main__":``.
+
     Examples
     --------
     >>> tetopt.save_image("ball.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))

@@ -14,7 +14,7 @@ from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState, foreign_files, state_of
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
-from tetopt.io.formats import FORMATS
+from tetopt.io.formats import BUILT_IN
 from tetopt.job.events import note
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.options import JobOptions, RunOptions, given_options
@@ -72,8 +72,8 @@ def subjects_of(path: Path, cohort: CohortOptions) -> list[Subject]:
 def checked_suffix(text: str) -> str:
     """The suffix of meshes' files; InputError for one that is no format's."""
     suffix = text.lower() if text.startswith(".") else f".{text.lower()}"
-    if suffix not in FORMATS:
-        raise InputError(f"`mesh_format`: expected one of {', '.join(FORMATS)}, got {text}")
+    if suffix not in BUILT_IN:  # subjects are run by processes of their own, which know no others
+        raise InputError(f"`mesh_format`: expected one of {', '.join(BUILT_IN)}, got {text}")
     return suffix
 
 

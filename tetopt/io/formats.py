@@ -56,7 +56,7 @@ FORMATS = {
 SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
 
 
-BUILT_IN = frozenset(FORMATS)
+BUILT_IN = tuple(FORMATS)
 
 
 def register_format(

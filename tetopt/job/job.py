@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from textwrap import wrap
 from types import UnionType
@@ -195,9 +195,9 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if own is int and is_number and abs(value) <= LARGEST_INTEGER and float(value).is_integer():
         return int(value)
     if own is str and (isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))):
-        return value if isinstance(value, str) else f"{value!r}"
+        return value if isinstance(value, str) else _number_text(value)
     if own is str and name == "weights" and isinstance(value, list | tuple):
-        return ",".join(f"{_of_kind(name, float, each):g}" for each in value)
+        return ",".join(repr(_of_kind(name, float, each)).removesuffix(".0") for each in value)
     if own is bool and isinstance(value, bool):
         return value
     choices = get_args(own)
@@ -205,6 +205,11 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         return value
     expected = " or ".join(map(str, choices)) if choices else KIND_WORDS[own]
     raise InputError(f"`{name}`: expected {expected}, got {_said(value)}")
+
+
+def _number_text(value: Any) -> str:
+    """A number as a text that is read back to its last bit."""
+    return str(int(value)) if isinstance(value, Integral) else repr(float(value))
 
 
 def _said(value: Any) -> str:

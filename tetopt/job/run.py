@@ -21,7 +21,7 @@ from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.summary import measured_each, model_summary
-from tetopt.system.files import save_json
+from tetopt.system.files import outputs_of_run, save_json
 
 
 class Result(NamedTuple):
@@ -97,6 +97,11 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     --------
     mesh_image : The same of an image in memory, without files.
 
+    Notes
+    -----
+    In parts, workers are processes that begin by importing your program: let it call this under
+    ``if __name__ == "__main__":``.
+
     Examples
     --------
     >>> tetopt.save_image("ball.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
@@ -105,7 +110,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     (300, {}, 'iterations')
     """
     begin = time.perf_counter()
-    with listened(on):
+    with listened(on), outputs_of_run(vars(job).values()):
         task = read(job)
         came = meshed(task, stop or (lambda: False), begin)
         failed: dict[str, str] = {}

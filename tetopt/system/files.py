@@ -64,6 +64,17 @@ def outputs_of_command() -> Iterator[Outputs]:
                 folder.rmdir()
 
 
+@contextmanager
+def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
+    """As `outputs_of_command`, for a run with these options that no command has begun."""
+    if _OUTPUTS.get() is not None:
+        yield
+        return
+    with outputs_of_command():
+        name_files(values)
+        yield
+
+
 def name_files(values: Iterable[Any]) -> None:
     """Note the paths among the values of a command's options, of which none may be named twice if one is an output."""
     if (outputs := _OUTPUTS.get()) is not None:
