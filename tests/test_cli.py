@@ -355,12 +355,13 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
         "box": "k_D.nii lies beyond",
     }
     with listened(show_event):
-        assert tell_violated(result, {}) == []
+        assert tell_violated(result, {}) == {}
         assert capsys.readouterr().err == ""
-        assert tell_violated(result._replace(violated=violated), {}) == list(violated.values())
+        assert tell_violated(result._replace(violated=violated), {}) == violated
     said = capsys.readouterr().err
     assert said == (
-        "tetopt: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\ntetopt: k_D.nii lies beyond\n"
+        "tetopt: requirement violated: min_dihedral: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\n"
+        "tetopt: requirement violated: box: k_D.nii lies beyond\n"
     )
 
 

@@ -16,6 +16,7 @@ from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
+from tetopt.job.events import listened
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
@@ -251,7 +252,7 @@ def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
     assert by_k_D[0]["E_D_fraction"] > by_k_D[-1]["E_D_fraction"]
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert (out / "tradeoff.png").stat().st_size > 20_000
-    assert "What tetopt&#x27;s options trade" in (out / "report.html").read_text()
+    assert "What tetopt&#39;s options trade" in (out / "report.html").read_text()
     assert main(["compare", *words, "--pipelines", "bcc", "--force"]) == 0
     assert not (out / "tradeoff.png").exists()
     assert "options trade" not in (out / "report.html").read_text()
@@ -327,7 +328,7 @@ def test_a_run_of_other_options_is_not_kept(head, tmp_path):
             image, None, parse_mapping(str(mapping)), settings, source, of_labels, str(mapping), ""
         )
         facts = compare._facts(comparison)
-        return compare._key(compare.Bench(comparison, None, {}, tmp_path, print, True, facts), "bcc")
+        return compare._key(compare.Bench(comparison, None, {}, tmp_path, True, facts), "bcc")
 
     assert set(Settings._fields) == set(OTHER_SETTINGS) | compare.FREE_SETTINGS
     first = key()
@@ -488,7 +489,8 @@ def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
     def chosen(comparison=comparison, resume=True, **changes):
         settings = comparison.settings._replace(**changes)
         facts = compare._facts(comparison)
-        once = compare._settled(comparison._replace(settings=settings), facts, tmp_path, lines.append, resume=resume)
+        with listened(lambda event: lines.append(event.text)):
+            once = compare._settled(comparison._replace(settings=settings), facts, tmp_path, resume=resume)
         return once.settings.reference_dofs
 
     assert chosen(reference_dofs=4000) == 4000

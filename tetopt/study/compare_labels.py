@@ -61,7 +61,7 @@ class LabelVerdict(NamedTuple):
     farther: list[str]  # those with a larger mean surface distance
 
 
-class Labels(NamedTuple):
+class LabelSection(NamedTuple):
     """What the section shows."""
 
     done: list[PipelineResult]  # with a mesh
@@ -75,7 +75,7 @@ class Labels(NamedTuple):
     fractions: list[list[str]]  # a table of E_D's
 
 
-def labels_of(report: Report) -> Labels | None:
+def labels_of(report: Report) -> LabelSection | None:
     """What the section shows; None without labels."""
     done = [pipeline for pipeline in report.pipelines if pipeline.median is not None]
     lines = [
@@ -91,7 +91,7 @@ def labels_of(report: Report) -> Labels | None:
     lost = [[(line, line.medians[k]) for line in lines if line.medians[k].n_lost] for k in range(len(done))]
     components = {row.label: row.components for each in done for run in each.runs for row in run.measurement.labels}
     titles = [pipeline.title for pipeline in done]
-    return Labels(
+    return LabelSection(
         done=done,
         first=titles[first],
         worst_first=sorted(lines, key=lambda line: (line.medians[first].dice or 0.0, line.voxels)),
