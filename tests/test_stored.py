@@ -1,5 +1,7 @@
 """An image whose voxels stay where they are: boxes of it are images in their own place."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,22 @@ def test_what_has_been_read_as_a_whole_is_not_read_again():
 def test_the_whole_of_what_no_image_takes_is_refused():
     with pytest.raises(InputError, match=r"1 voxels are NaN or infinite, the first at index \(0, 1, 0\)"):
         _ = Image.stored(np.array([[[1.0], [np.nan]]])).data
+
+
+def test_boxes_are_as_the_voxels_lie(monkeypatch):
+    """Of what NIfTI has mapped all planes and some rows, else some planes; of chunks whole ones, dask's largest."""
+    monkeypatch.setattr("tetopt.image.READ_BYTES", 2 * 4 * 6 * 8)
+    voxels = np.zeros((8, 6, 8), dtype=np.int16)
+    chunked = SimpleNamespace(shape=(8, 6, 8), dtype=voxels.dtype, chunks=((3, 4, 1), (6,), (8,)))
+    zarr = SimpleNamespace(shape=(8, 6, 8), dtype=voxels.dtype, chunks=(2, 3, 8))
+    first = {
+        name: next(Image.stored(each).boxes())[:2]
+        for name, each in {"C": voxels, "F": np.asfortranarray(voxels), "dask": chunked, "zarr": zarr}.items()
+    }
+    assert first == {
+        "C": (slice(0, 4), slice(0, 6)), "F": (slice(0, 8), slice(0, 3)),
+        "dask": (slice(0, 4), slice(0, 6)), "zarr": (slice(0, 2), slice(0, 6)),
+    }  # fmt: skip
 
 
 def test_boxes_cover_every_voxel_once_in_memory_and_stored(monkeypatch):
