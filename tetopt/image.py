@@ -113,17 +113,14 @@ class Image:
     def data(self) -> NDArray[np.floating]:
         """All intensities, as of `Image(data)`; those of a stored image are read when first asked for, and kept."""
         check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read boxes of it")
-        return _checked_data(self.read((0,) * self.ndim, self.shape))
+        whole = _checked_data(self.read((0,) * self.ndim, self.shape))
+        vars(self).update(voxels=whole)  # boxes are read from it from now on
+        return whole
 
     @property
     def is_stored(self) -> bool:
         """Whether the voxels are where they are stored, and have not been read as a whole."""
         return "data" not in vars(self)
-
-    @property
-    def _readable(self) -> Any:
-        """What boxes are read from: the voxels in memory, once they are there."""
-        return vars(self).get("data", self.voxels)
 
     @property
     def in_memory(self) -> Image | None:
@@ -133,7 +130,7 @@ class Image:
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
-        return tuple(int(size) for size in self._readable.shape)
+        return tuple(int(size) for size in self.voxels.shape)
 
     @property
     def ndim(self) -> int:
@@ -218,7 +215,7 @@ class Image:
         >>> stored.read((0, 0, 0), (1, 2, 4)).tolist()
         [[[0, 1, 2, 3], [4, 5, 6, 7]]]
         """
-        return np.asarray(self._readable[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
+        return np.asarray(self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
         """The voxels of a box of indices as an image in memory; every voxel keeps its place in the world.
@@ -274,11 +271,8 @@ class Image:
         s0, s1, s2 = shape = (1,) * (3 - self.ndim) + self.shape
         if not self.is_stored:
             return _boxes(shape, max(PIECE_VOXELS // (s1 * s2), 1), s1)
-        chunks, most_rows = (
-            getattr(self.voxels, "chunks", None),
-            READ_BYTES // (s2 * np.dtype(self.voxels.dtype).itemsize),
-        )
-        most_rows = max(most_rows, 1)
+        chunks = getattr(self.voxels, "chunks", None)
+        most_rows = max(READ_BYTES // (s2 * np.dtype(self.voxels.dtype).itemsize), 1)
         if chunks:
             # Those of dask are all told, along each axis.
             n_planes, step = (min(int(np.max(sizes)), s) for sizes, s in zip(chunks[:2], (s0, s1), strict=True))
@@ -292,7 +286,7 @@ class Image:
 
     def __repr__(self) -> str:
         values = "stored" if self.is_stored else f"{self.data.min():.4g} to {self.data.max():.4g}"
-        return f"Image({self._size()}, {self._readable.dtype}, {values})"
+        return f"Image({self._size()}, {self.voxels.dtype}, {values})"
 
     def _size(self) -> str:
         """Number and size of voxels."""
@@ -301,7 +295,7 @@ class Image:
 
     def _repr_html_(self) -> str:
         """Numbers and the middle slice, for a notebook; of a stored image neither intensities nor a picture."""
-        rows = [("size", self._size()), ("kind", str(self._readable.dtype))]
+        rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
         if self.is_stored:
             return notebook.card_html("Image", rows, "")
         low, high, mean = self.data.min(), self.data.max(), self.data.mean(dtype=np.float64)

@@ -21,6 +21,7 @@ from tetopt.cohort.estimate import need_of
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row
 from tetopt.cohort.options import CohortOptions
+from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
 from tetopt.job.events import Event, listened
 from tetopt.job.options import RunOptions
@@ -121,13 +122,7 @@ class _CohortDisplay:
         counts = Counter[str](row.status for row in own)
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
             log.print(escape(f"{row.key}: {row.reason}"))
-        words = {
-            "done": "done",
-            "violated": "done, but violates a requirement",
-            "failed": "failed",
-            "missing": "not run",
-        }
-        parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
+        parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
         out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
             more = f"{counted(n_more, 'subject')} more in {place}, from other tables, are shown with these"

@@ -26,7 +26,7 @@ from tetopt.cohort.layout import (
 )
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.page import save_cohort_files
+from tetopt.cohort.page import STATUS_WORDS, save_cohort_files
 from tetopt.cohort.plan import (
     PlannedSubject,
     checked_suffix,
@@ -181,9 +181,9 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
 def _tell_plan(plan: CohortPlan) -> None:
     """How many subjects there are of each kind, and why the ones are run that are there already."""
     counts = Counter[str](entry.state.status for entry in plan.entries)
-    words = {"done": "done", "violated": "with a violated requirement", "failed": "failed", "changed": "changed"}
+    words = {name: STATUS_WORDS.get(name, name) for name in ("done", "violated", "failed", "changed")}
+    words["missing"] = "not yet run"
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
-    parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
     note(f"{counted(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run")
     reasons = Counter((e.state.status, e.state.why) for e in plan.to_run if e.state.status in ("changed", "failed"))
     for (status, why), number in reasons.most_common(NAMED_FAILURES):

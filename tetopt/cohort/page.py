@@ -14,7 +14,7 @@ from urllib.parse import quote
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, label_quantities, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
-from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
+from tetopt.cohort.numbers import Row, Value, description, present, save_table
 from tetopt.errors import InputError
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
 from tetopt.system.incoming import own_bytes
@@ -45,7 +45,7 @@ FIRST_COLUMNS = (
 )  # fmt: skip
 OPTION_BEGINNINGS = ("options.", "request.options.")  # of the columns of a run's options
 FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # by which the script knows what is there
-STATUS_WORDS: dict[Status, str] = {
+STATUS_WORDS: dict[str, str] = {
     "done": "done", "violated": "with a violated requirement", "failed": "failed", "missing": "not run",
 }  # fmt: skip
 
@@ -104,7 +104,7 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
 
 def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     """How many subjects are done and so on, how long they took, and what they have in common."""
-    counts = Counter(row.status for row in rows)
+    counts = Counter[str](row.status for row in rows)
     words = [f"{counts[status]} {words}" for status, words in STATUS_WORDS.items() if counts[status]]
     text = f"{len(rows)} subject{'s' if len(rows) != 1 else ''}: {', '.join(words) or 'none'}."
     if n_odd := sum(bool(each) for each in flags):

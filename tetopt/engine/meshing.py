@@ -306,7 +306,7 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
     The result of the run that is nearest, or of one that was cut short.
     """
     corners, ratio = 0, QUADRATIC_NODES[ndim]
-    tried: list[tuple[float, MeshingResult]] = []
+    nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more whole meshes are kept
     for _ in range(NODE_RUNS):
         before, corners = corners, max(round(nodes / ratio), 2 ** (ndim + 1))
         if corners == before:
@@ -315,10 +315,10 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
         count = node_count(result.mesh.points, result.mesh.cells, 2)
         ratio = count / len(result.mesh.points)
         miss = abs(count / nodes - 1.0)
-        tried.append((miss, result))
+        nearest = [min([*nearest, (miss, result)], key=lambda each: each[0])]
         if miss <= NODES_NEAR or result.ended in CUT_SHORT:
             break
-    return min(tried, key=lambda each: each[0])[1]
+    return nearest[0][1]
 
 
 def meshed_to_error(
@@ -349,7 +349,7 @@ def meshed_to_error(
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
-    results: list[MeshingResult] = []
+    best: list[MeshingResult] = []  # the one so far: no more whole meshes are kept
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
         nodes = max(nodes, fewest)
@@ -363,27 +363,18 @@ def meshed_to_error(
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
         count, fraction = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
         if result.ended in CUT_SHORT:
-            reached = [each for each in results if fractions[len(each.mesh.points)] <= target_error]
-            return _best(reached, fractions, target_error) if reached else result
+            return best[0] if best and fractions[len(best[0].mesh.points)] <= target_error else result
         if count in fractions:
             break
         fractions[count] = fraction
-        results.append(result)
+        if not best or _is_better(count, len(best[0].mesh.points), fractions, target_error):
+            best = [result]
         if ERROR_REACHED * target_error <= fraction <= target_error:
             return result
         nodes = _next_nodes(content.image, fractions, target_error)
         if nodes in fractions:
             break
-    return _best(results, fractions, target_error)
-
-
-def _best(results: list[MeshingResult], fractions: dict[int, float], target: float) -> MeshingResult:
-    """The first of the results than which none is better."""
-    best = results[0]
-    for result in results[1:]:
-        if _is_better(len(result.mesh.points), len(best.mesh.points), fractions, target):
-            best = result
-    return best
+    return best[0]
 
 
 def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:

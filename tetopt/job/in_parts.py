@@ -255,8 +255,8 @@ def _request(task: Task) -> PartsRequest:
         "sizes": None if sizes is None else [sizes.smallest, sizes.longest, sizes.gradation],
         "place": place,
     }  # fmt: skip
-    checksum = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
-    return PartsRequest(**values, sizes=sizes, checksum=checksum)
+    digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+    return PartsRequest(**values, sizes=sizes, checksum=digest)
 
 
 def end_parts(mesh: Path, result: MeshingResult) -> None:

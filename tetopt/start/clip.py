@@ -62,12 +62,12 @@ def lattice_within(
     if region is None or nodes is None:
         mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
         return mesh if region is None else clipped(mesh, image, region)
-    in_box, meshes = nodes * region.inside.size / region.inside.sum(), []  # nodes of a lattice of the whole box
+    in_box, nearest = nodes * region.inside.size / region.inside.sum(), list[Mesh]()  # nodes of a lattice of the box
     for _ in range(LATTICE_TRIALS):
         mesh = clipped(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
-        meshes.append(mesh)
+        nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
         in_box *= nodes / len(mesh.points)
-    return min(meshes, key=lambda mesh: abs(len(mesh.points) - nodes))
+    return nearest[0]
 
 
 def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -244,21 +244,21 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     if region is None:
         return _octree_of_box(content, nodes, limits)
     # The surface takes away nodes and adds others; how many is known only afterwards.
-    meshes, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
+    nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
         try:
             mesh = clipped(_octree_of_box(content, in_box, limits), image, region)
         except InputError:  # the region is thinner than the cells
-            if not meshes and trial == MASK_TRIALS - 1:
+            if not nearest and trial == MASK_TRIALS - 1:
                 raise
             in_box *= 2
             continue
         count = len(mesh.points)
-        meshes.append(mesh)
+        nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
         if abs(count - nodes) <= TRIAL_MISS * nodes:
             break
         in_box = int(np.clip(in_box * nodes / count, max(fewest, in_box / 2), 2 * in_box))
-    return min(meshes, key=lambda mesh: abs(len(mesh.points) - nodes))
+    return nearest[0]
 
 
 def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
