@@ -162,19 +162,28 @@ def test_a_worker_over_its_limit_is_ended_by_its_nanny_and_the_limit_named(run, 
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def appeared(path):
+    """Wait for a file, a minute at most."""
+    end = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.02)
+
+
 def waiting(folder, name):
+    """The short one ends once the long one has begun, which ends with the test."""
     (folder / name).touch()
-    time.sleep(0.3 if name == "short" else 3)
+    appeared(folder / {"short": "long", "long": "end"}[name])
     return name
 
 
 def test_once_it_is_over_nothing_begins_and_the_last_are_waited_for(run, tmp_path):
     done = run(
-        partial(waiting, tmp_path), ["short", "long", "c", "d"], last_seconds=0.5,
+        partial(waiting, tmp_path), ["short", "long", "c", "d"], last_seconds=5,
         is_over=lambda: len(list(tmp_path.iterdir())) == 2,
     )  # fmt: skip
     assert list(done) == ["short"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["long", "short"]
+    (tmp_path / "end").touch()
 
 
 def test_a_scheduler_that_is_lost_is_said_so(tmp_path):
