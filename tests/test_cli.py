@@ -27,13 +27,13 @@ import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
+from tetopt.contents.phantom import phantom_names
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import FORMER_NAMES
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import listened
 from tetopt.measure.segmentation import dice, segment
-from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import tetopt
-from tetopt import phantom
 from tetopt.cli import main
+from tetopt.contents import phantom
 
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference"
 

@@ -19,6 +19,6 @@ def __getattr__(name: str) -> Any:
     """A public name, whose module is loaded when it is first used: `tetopt --help` needs none of the kernels."""
     value = _loaded(name)
     if isfunction(value):  # whoever calls it by this name may give it anything
-        value = import_module("tetopt.public").checked(value)
+        value = import_module("tetopt.system.public").checked(value)
     globals()[name] = value
     return value

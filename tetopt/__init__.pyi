@@ -1,6 +1,6 @@
 """The public names of tetopt, and the modules that they are loaded from."""
 
-from .check import check_mesh as check_mesh
+from .geometry.check import check_mesh as check_mesh
 from .cohort.cohort import run_cohort as run_cohort
 from .contents.align import (
     foreground_mask as foreground_mask,
@@ -59,7 +59,7 @@ from .model.loads import Load as Load
 from .model.materials import BinningError as BinningError, Materials as Materials
 from .model.model import Model as Model
 from .model.sets import Box as Box, Sets as Sets
-from .phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
+from .contents.phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
 from .start.lattice import lattice_mesh as lattice_mesh
 from .start.octree import octree_mesh as octree_mesh
 from .start.sizes import Sizes as Sizes

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt import notebook
 from tetopt.errors import InputError
+from tetopt.interop import notebook
 from tetopt.system.budget import check_memory
 
 SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space

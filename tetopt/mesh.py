@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt import conversions, notebook
-from tetopt.conversions import MESHIO_KINDS, VTK_KINDS, Fields
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
+from tetopt.interop import conversions, notebook
+from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
 
 if TYPE_CHECKING:
     import meshio

@@ -7,8 +7,8 @@ import pytest
 from states import ball
 
 import tetopt
-from tetopt.check import check_unfolded, manifold_problems
 from tetopt.energy.sampling import overlap_of
+from tetopt.geometry.check import check_unfolded, manifold_problems
 from tetopt.io.formats import file_bytes
 from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import save_volume

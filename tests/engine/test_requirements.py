@@ -5,9 +5,9 @@ import pytest
 from shapes import shaped
 
 import tetopt
-from tetopt.check import manifold_problems
 from tetopt.contents.content import content, plain
 from tetopt.engine.requirements import checked, requested
+from tetopt.geometry.check import manifold_problems
 
 
 def violated(target, result, min_dihedral=0.0, start=None):

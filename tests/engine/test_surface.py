@@ -8,7 +8,6 @@ import pytest
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
-from tetopt.check import manifold_problems
 from tetopt.contents.content import content
 from tetopt.contents.domain import levels, region_of
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
@@ -16,6 +15,7 @@ from tetopt.engine.complex import build
 from tetopt.engine.fast import Run
 from tetopt.engine.state import objective_of, sides_of
 from tetopt.engine.surface import level_at, put_on_surface
+from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.topology import boundary_facets, components
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.start.clip import lattice_within

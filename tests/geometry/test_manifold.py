@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tetopt
-from tetopt.check import manifold_problems
+from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.manifold import manifold_part
 from tetopt.geometry.simplex import volumes
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from commands import exit_code
 
+from tetopt.contents.phantom import load_phantom
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import zarr_images
 from tetopt.io.images import file_shape, load_image, save_image, sha256
 from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
 from tetopt.io.zarr_images import save_zarr
-from tetopt.phantom import load_phantom
 from tetopt.system import budget
 
 zarr = pytest.importorskip("zarr")

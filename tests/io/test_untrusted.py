@@ -14,6 +14,7 @@ import pytest
 
 import tetopt
 from tetopt.cli import main
+from tetopt.contents.phantom import load_phantom
 from tetopt.errors import InputError
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
@@ -24,7 +25,6 @@ from tetopt.job.inputs import file_and_volume
 from tetopt.job.model import parsed_bins
 from tetopt.model.labels import labels_named
 from tetopt.model.mappings import load_mapping
-from tetopt.phantom import load_phantom
 from tetopt.system import budget, incoming
 from tetopt.system.incoming import json_of, text_of, toml_of
 

@@ -16,12 +16,12 @@ import numpy as np
 from worlds import random_world
 
 import tetopt
-from tetopt.check import manifold_problems
 from tetopt.contents.content import plain
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import build, remeasure
 from tetopt.engine.fast import FAR_TICKS, Run
 from tetopt.engine.interfaces import relabel
+from tetopt.geometry.check import manifold_problems
 from tetopt.start.sizes import Sizes
 
 CHECKED_EVERY = 1000  # operations

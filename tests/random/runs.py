@@ -122,8 +122,8 @@ def faults_of(world, target, request, min_dihedral, result):
         outer = np.unique(tetopt.geometry.topology.boundary_facets(request["start"].cells))
         kept = {tuple(place) for place in mesh.points.tolist()}
         wrong += [] if all(tuple(p) in kept for p in request["start"].points[outer].tolist()) else ["a boundary moved"]
-    problems = [] if is_filled else tetopt.check.manifold_problems(mesh)
-    problems += [] if result.labels is None else tetopt.check.manifold_problems(mesh, result.labels)
+    problems = [] if is_filled else tetopt.geometry.check.manifold_problems(mesh)
+    problems += [] if result.labels is None else tetopt.geometry.check.manifold_problems(mesh, result.labels)
     if bool(problems) != ("manifold" in violated):
         wrong.append(f"{problems}, violated: {sorted(violated)}")
     n_pieces = 1 if is_filled else scipy.ndimage.label(region.inside)[1]

@@ -28,8 +28,8 @@ from tetopt.job.options import (
     kinds_of,
     option_name,
 )
-from tetopt.public import LARGEST_INTEGER
 from tetopt.system.files import checked_output, name_files
+from tetopt.system.public import LARGEST_INTEGER
 
 
 def option(metavar: str | None, text: str, *names: str, **more: Any) -> Any:

@@ -107,7 +107,7 @@ def build(
 ) -> State:
     """The state of a conforming mesh, everything measured.
 
-    `ticks` and `is_frozen` are kept, not copied. The cells must be a mesh: at most two to a facet, see `tetopt.check`.
+    `ticks` and `is_frozen` are kept, not copied. The cells must be a mesh: at most two to a facet (`check_mesh`).
     """
     n_cells, n_corners = cells.shape
     room = n_cells + n_cells // 4 + 64

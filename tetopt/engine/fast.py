@@ -44,8 +44,8 @@ from tetopt.engine.state import angle_limit_of, content_energies, state_of, with
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
+from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
-from tetopt.notebook import with_bar
 from tetopt.start.carve import carved
 from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes

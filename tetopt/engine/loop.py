@@ -10,12 +10,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt import notebook
 from tetopt.contents.labels import colours_by_number
 from tetopt.energy.sampling import SamplingGrid
 from tetopt.geometry.box import facets_on_sides
 from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
+from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 
 # The defaults of every way in, and their evidence (docs/measured/k_d.md, docs/understand/sizes.md).

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.check import filled_fraction
 from tetopt.contents.content import plain
 from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
@@ -30,10 +29,11 @@ from tetopt.engine.requirements import checked
 from tetopt.engine.state import unweighted, weighted
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
+from tetopt.geometry.check import filled_fraction
 from tetopt.geometry.topology import facets, folded, greedy_colours
 from tetopt.image import Image
+from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
-from tetopt.notebook import with_bar
 from tetopt.start.delaunay import delaunay
 from tetopt.system.kernels import packed
 

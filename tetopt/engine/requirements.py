@@ -12,13 +12,13 @@ from math import prod
 
 import numpy as np
 
-from tetopt.check import beyond_box, manifold_problems
 from tetopt.contents.content import Content
 from tetopt.contents.domain import Region
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
+from tetopt.geometry.check import beyond_box, manifold_problems
 from tetopt.geometry.simplex import dihedral_angles, volumes
 from tetopt.geometry.topology import components
 from tetopt.image import Image

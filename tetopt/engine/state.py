@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.check import check_unfolded
 from tetopt.contents.content import Content
 from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks, volume_of
 from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, Whole, frozen_axes, side_ticks
 from tetopt.errors import InputError
+from tetopt.geometry.check import check_unfolded
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh

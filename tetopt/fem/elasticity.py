@@ -30,10 +30,10 @@ from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_arra
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from tetopt.check import check_unfolded, facets_on_box, filled_fraction
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
+from tetopt.geometry.check import check_unfolded, facets_on_box, filled_fraction
 from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order, shape_slopes
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, rows_by_kind, simplices_of
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
+from tetopt.interop.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, rows_by_kind, simplices_of
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk

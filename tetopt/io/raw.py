@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.conversions import CELL_DIMENSIONS, corner_kinds
+from tetopt.interop.conversions import CELL_DIMENSIONS, corner_kinds
 
 
 class RawGrid(NamedTuple):

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.conversions import CELL_DIMENSIONS
 from tetopt.errors import InputError
+from tetopt.interop.conversions import CELL_DIMENSIONS
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.image import Image
+from tetopt.interop.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.conversions import VTK_KINDS
 from tetopt.errors import InputError
+from tetopt.interop.conversions import VTK_KINDS
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
 from tetopt.io.raw import RawGrid
 from tetopt.io.read_vtk import checked_grid, plain_arrays

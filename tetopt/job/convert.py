@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.check import check_unfolded
 from tetopt.contents.align import resample_mask
 from tetopt.contents.content import continued
 from tetopt.errors import InputError
+from tetopt.geometry.check import check_unfolded
 from tetopt.image import Image
 from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of

@@ -17,8 +17,8 @@ from tetopt.errors import InputError
 from tetopt.job.options import JobOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
 from tetopt.model.mappings import MAPPED_OPTIONS
-from tetopt.public import LARGEST_INTEGER
 from tetopt.system.incoming import json_of
+from tetopt.system.public import LARGEST_INTEGER
 
 Record = TypeVar("Record")
 MOST_SAID = 80  # letters of a value in a message

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.check import check_mesh, manifold_problems
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
+from tetopt.geometry.check import check_mesh, manifold_problems
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
 from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image

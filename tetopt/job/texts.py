@@ -9,7 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from tetopt.errors import InputError
 from tetopt.job.options import Option, RunOptions, kinds_of, near_hint, option_name, option_of
-from tetopt.public import LARGEST_INTEGER
+from tetopt.system.public import LARGEST_INTEGER
 
 
 def option_words(options: dict[str, Any]) -> list[str]:

@@ -17,11 +17,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.check import facets_on_box
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
+from tetopt.geometry.check import facets_on_box
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed

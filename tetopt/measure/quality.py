@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import notebook
 from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
+from tetopt.interop import notebook
 
 BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
 SHORT_EDGE = 0.25  # of the longest: an edge shorter than this makes a flat cell a wedge

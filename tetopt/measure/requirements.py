@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.check import beyond_box
 from tetopt.contents.content import Content
 from tetopt.energy.discretization import content_E_D
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.requirements import BEYOND_WORDS, checked, requested
 from tetopt.geometry.box import ON_SIDE_VOXELS
+from tetopt.geometry.check import beyond_box
 from tetopt.mesh import Mesh
 
 

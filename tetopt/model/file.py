@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import notebook
+from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
 from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words

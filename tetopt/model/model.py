@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import conversions, notebook
-from tetopt.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
+from tetopt.interop import conversions, notebook
+from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.mesh import Mesh
 from tetopt.model.fields import (
     GAUSS_MODULI,

@@ -15,11 +15,11 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
+from tetopt.geometry.check import facets_on_box
 from tetopt.geometry.cut import plane_cut, triangle_cut
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import facets

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt.contents.phantom import load_phantom
 from tetopt.energy.discretization import E_D, combined
 from tetopt.energy.geometric import E_G
 from tetopt.engine.loop import MeshingResult
@@ -29,7 +30,6 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import cell_young
 from tetopt.model.mappings import ModulusMapping
 from tetopt.model.materials import DEFAULT_NU
-from tetopt.phantom import load_phantom
 from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import lattice_mesh
 

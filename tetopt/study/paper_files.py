@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tetopt.contents.labels import check_labels
+from tetopt.contents.phantom import load_phantom
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
@@ -22,7 +23,6 @@ from tetopt.job.inputs import checked_outputs, image_and_labels
 from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
-from tetopt.phantom import load_phantom
 from tetopt.report.figures import save_figure, slice_figure
 from tetopt.report.page import save_page
 from tetopt.report.scene import (

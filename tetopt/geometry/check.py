@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,8 +12,10 @@ from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
-from tetopt.image import Image
-from tetopt.mesh import Mesh
+
+if TYPE_CHECKING:
+    from tetopt.image import Image
+    from tetopt.mesh import Mesh
 
 
 def check_mesh(

@@ -10,7 +10,7 @@ import pytest
 
 import tetopt
 from tetopt.io.images import load_image
-from tetopt.public import check_arguments
+from tetopt.system.public import check_arguments
 
 IMAGE = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7, 8)))
 MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])

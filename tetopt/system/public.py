@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
+import tetopt
 from tetopt.errors import InputError
 
 ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # as annotations call them
@@ -97,7 +98,7 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
             return False
         item = inner.split(",")[0]
         return not isinstance(value, list | tuple) or all(_is_of(item, each, names) is not False for each in value)
-    known = names.get(kind)
+    known = getattr(tetopt, kind) if kind in REMEDIES else names.get(kind)
     if get_origin(known) is Literal:  # which text, the function's own message tells
         return isinstance(value, str)
     return isinstance(value, known) if isinstance(known, type) else None

@@ -12,9 +12,9 @@ from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 import tetopt
 from tetopt import InputError, Mesh
-from tetopt.conversions import add_array
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
+from tetopt.interop.conversions import add_array
 
 VTK_NUMBERS = {2: (pyvista.CellType.TRIANGLE, pyvista.CellType.QUADRATIC_TRIANGLE),
                3: (pyvista.CellType.TETRA, pyvista.CellType.QUADRATIC_TETRA)}  # fmt: skip

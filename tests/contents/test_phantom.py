@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-import tetopt.phantom
+import tetopt.contents.phantom
+from tetopt.contents.phantom import Shape, load_phantom, phantom_folder, phantom_names, signed_distance
 from tetopt.errors import InputError
-from tetopt.phantom import Shape, load_phantom, phantom_folder, phantom_names, signed_distance
 
 HEAD_2D = """
 name = "test"
@@ -454,7 +454,7 @@ def test_names_are_those_of_the_folder():
 def test_folder_inside_the_installed_package_comes_first(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "tetopt"
     (package / "phantoms").mkdir(parents=True)
-    monkeypatch.setattr(tetopt.phantom, "__file__", str(package / "phantom.py"))
+    monkeypatch.setattr(tetopt.contents.phantom, "__file__", str(package / "contents" / "phantom.py"))
     assert phantom_folder() == (package / "phantoms").resolve()
 
 
@@ -630,7 +630,7 @@ def test_voxels_that_no_image_has_are_refused_before_they_are_painted(tmp_path, 
         ]
     )
     (tmp_path / "a.toml").write_text(text)
-    monkeypatch.setattr(tetopt.phantom, "_voxel_centers", None)  # nothing may be painted
+    monkeypatch.setattr(tetopt.contents.phantom, "_voxel_centers", None)  # nothing may be painted
     with pytest.raises(InputError, match=r"phantom 'a': .*1000 times as long"):
         load_phantom(tmp_path / "a.toml").image()
 
@@ -660,7 +660,7 @@ def test_voxels_are_the_same_in_whatever_boxes(name, options):
 
 def test_noise_of_more_planes_than_fit_is_refused(monkeypatch):
     voxels = load_phantom("sphere").voxels(2, noise_sd=1.0)
-    monkeypatch.setattr(tetopt.phantom, "check_memory", lambda n_bytes, *_: 1 / (n_bytes < 8 * 32**3))
+    monkeypatch.setattr(tetopt.contents.phantom, "check_memory", lambda n_bytes, *_: 1 / (n_bytes < 8 * 32**3))
     voxels[slice(0, 16), slice(0, 1), slice(0, 1)]
     with pytest.raises(ZeroDivisionError):
         voxels[slice(0, 32), slice(0, 1), slice(0, 1)]

@@ -572,7 +572,7 @@ class PhantomVoxels:
 
 def phantom_folder() -> Path:
     """Folder of the project's own phantoms: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     inside = package / "phantoms"
     return inside if inside.is_dir() else package.parent / "phantoms"
 
@@ -605,7 +605,7 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     >>> phantom = tetopt.load_phantom("two_spheres")
     >>> phantom.size_mm.tolist(), [shape.name for shape in phantom.shapes]
     ([80.0, 60.0, 60.0], ['large inclusion', 'small inclusion'])
-    >>> tetopt.phantom.phantom_names()[:3]
+    >>> tetopt.contents.phantom.phantom_names()[:3]
     ['constant', 'disc_2d', 'ellipsoids_brain']
     """
     path = Path(name_or_path)

@@ -10,8 +10,8 @@ import pytest
 from models import quadratic_model, sample_model
 
 import tetopt
-from tetopt import notebook
 from tetopt.engine.loop import MeshingResult
+from tetopt.interop import notebook
 from tetopt.report.colours import label_colours
 
 

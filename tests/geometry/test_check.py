@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.check import check_unfolded
+from tetopt.geometry.check import check_unfolded
 from tetopt.measure.fidelity import cell_labels
 
 IMAGE = tetopt.Image(np.zeros((8, 9, 10)), np.diag([1.0, 2.0, 0.5, 1.0]))

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
-from tetopt.notebook import in_kernel
+from tetopt.interop.notebook import in_kernel
 from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Meshes as other libraries and notebooks hold and show them."""
