@@ -1,0 +1,71 @@
+"""Whether the tests see small faults: each mutant of the lists beside this file is put in, and its tests must fail.
+
+Run as ``python tests/mutants/run.py [LIST ...]``. Mutants are put into a copy of the tree, never into the tree itself.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+COPY = ROOT / ".mutants"  # of always the same place: numba's cache goes by paths
+
+
+def copied() -> None:
+    """Copy the files that git knows, with their times, to COPY."""
+    names = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\n")
+    shutil.rmtree(COPY, ignore_errors=True)
+    for name in filter(None, names):
+        if (ROOT / name).is_file():
+            (COPY / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, COPY / name)
+
+
+def is_killed(mutant: dict[str, str]) -> bool:
+    """Whether the tests of a mutant fail with it.
+
+    Keys are file, old (which is there once), new, tests (files, and options of pytest), and plain, which is true where
+    kernels are to run as Python.
+    """
+    path = COPY / mutant["file"]
+    text = path.read_text(encoding="utf-8")
+    if text.count(mutant["old"]) != 1:
+        raise SystemExit(f"{mutant['file']}: expected {mutant['old']!r} once, got {text.count(mutant['old'])} times")
+    environment = os.environ | {"PYTHONPATH": str(COPY), "PYTHONUTF8": "1", "MPLBACKEND": "agg", "PYTEST_ADDOPTS": ""}
+    environment |= {"NUMBA_CACHE_DIR": str(ROOT / ".numba_cache" / "mutants")}
+    environment |= {"NUMBA_DISABLE_JIT": "1"} if mutant.get("plain") else {}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not slow"]
+    status = path.stat()
+    path.write_text(text.replace(mutant["old"], mutant["new"]), encoding="utf-8")
+    try:
+        run = subprocess.run(
+            [*command, *mutant["tests"].split()], cwd=COPY, env=environment, capture_output=True, text=True
+        )
+    finally:
+        path.write_text(text, encoding="utf-8")
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    if run.returncode not in (0, 1):  # 2 to 5: no tests, or they could not be collected
+        raise SystemExit(f"{mutant['file']}: pytest exited with {run.returncode}\n{run.stdout[-2000:]}")
+    return run.returncode == 1
+
+
+def main() -> int:
+    """Print a line a mutant; 1 if one survives."""
+    lists = [Path(name) for name in sys.argv[1:]] or sorted(Path(__file__).parent.glob("*.toml"))
+    copied()
+    killed = []
+    for path in lists:
+        for mutant in tomllib.loads(path.read_text(encoding="utf-8"))["mutant"]:
+            killed.append(is_killed(mutant))
+            print("killed  " if killed[-1] else "SURVIVED", mutant["file"], mutant["new"].strip()[:80], flush=True)
+    print(f"{sum(killed)} of {len(killed)} mutants killed")
+    return int(not all(killed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
