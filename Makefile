@@ -6,18 +6,36 @@ BIN := $(VENV)/bin
 NUMBA_CACHE = $(CURDIR)/.numba_cache/$(shell cat tetopt/*.py tetopt/*/*.py | cksum | cut -d' ' -f1)
 # UTF-8, as Python chooses it by itself, but not in the processes that pytest-xdist starts.
 TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
+ALL_CORES = -n auto --dist loadfile --no-loadscope-reorder
+# Containers forbid Python to keep what it compiled: `tetopt mesh --help` takes 1.3 instead of 0.9 s then.
+export PYTHONDONTWRITEBYTECODE =
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo check test test-deep test-mutants dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
 
+# Between edits: units, laws, twins, one whole run of each command.
+check: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	$(TESTED) -q -m "not (full or deep or slow)" $(ALL_CORES)
+
+# All behaviour that users meet.
 test: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	$(TESTED) -m "not slow" -n auto --dist loadfile --no-loadscope-reorder
+	$(TESTED) -m "not (deep or slow)" $(ALL_CORES)
+
+# Processes and faults, and the kernels in other modes: what `.ci/run` runs beside `make test`.
+test-deep: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	$(TESTED) -q -m "deep and not slow" $(ALL_CORES)
 	$(MAKE) --no-print-directory -j 2 test-onethread test-nojit
+
+# Whether tests see the faults of tests/mutants: an hour.
+test-mutants: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/mutants/run.py
 
 # The small cases again on one thread, and with the kernels run as plain Python; no other file is read for that.
 KERNEL_TESTS = $(shell grep -rl --include='test_*.py' 'mark\.kernel' tests)
@@ -42,7 +60,7 @@ test-bounds: $(VENV)/.test
 
 # The wheel and the archive of sources, into dist/: checked, each installed into a fresh environment, and run there.
 dist: $(VENV)/bin/python
-	$(BIN)/python scripts/dist.py dist
+	$(BIN)/python .ci/dist.py dist
 
 # The suite with the lowest versions of all packages that pyproject.toml allows, in an environment of its own.
 LOWEST = .venv-lowest
@@ -52,7 +70,7 @@ test-lowest:
 	$(LOWEST)/bin/python -m uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e ".[test]"
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest $(LOWEST)/bin/tetopt warm-up
 	PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest MPLBACKEND=agg \
-	  $(LOWEST)/bin/python -m pytest -m "not slow" -n auto --dist loadfile --no-loadscope-reorder
+	  $(LOWEST)/bin/python -m pytest -m "not slow" $(ALL_CORES)
 
 # A million random operations of the engine, 500 random whole runs and 500 of labels by the defaults, two hours.
 test-random: $(VENV)/.test
@@ -113,19 +131,20 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/benchmark_kernels.py -o bench_kernels.json --force
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/fit_cost.py --rows cost_runs.jsonl -o cost.toml --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/fit_cost.py --rows cost_runs.jsonl -o cost.toml --force
 
 # Memory and time of a mesh in parts, of EDGE^3 voxels: 1024 takes three quarters of an hour, and 2 GB in FOLDER.
 EDGE ?= 1024
 FOLDER ?= /tmp
 bench-blocks: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark_blocks.py $(EDGE) --folder $(FOLDER) -o bench_blocks.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/benchmark_blocks.py $(EDGE) --folder $(FOLDER) -o bench_blocks.json --force
 
 # Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
 fingerprints: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -141,4 +160,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo docs/_build docs/gallery bench.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
+	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo docs/_build docs/gallery bench.json bench_kernels.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json

@@ -88,4 +88,4 @@ def test_long_files_begin_first():
 @pytest.mark.slow
 def test_wheel_and_sources_install_and_run(tmp_path):
     """As `make dist`: built, checked, installed into fresh environments, and run there. Needs an index of packages."""
-    subprocess.run([sys.executable, ROOT / "scripts" / "dist.py", tmp_path / "dist"], cwd=tmp_path, check=True)
+    subprocess.run([sys.executable, ROOT / ".ci" / "dist.py", tmp_path / "dist"], cwd=tmp_path, check=True)

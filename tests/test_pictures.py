@@ -24,7 +24,7 @@ def test_a_picture_has_its_page_and_its_command(path):
     is_in_table = path.stem in drawing.PICTURES or path.name in drawing.COMMANDS
     line = re.compile(rf"^.*(tetopt|python|make|chromium) .*\b{re.escape(path.name)}", re.MULTILINE)
     assert is_in_table or any(line.search(text) for text in PAGES.values()), "nothing tells how it was made"
-    assert path.stat().st_size <= drawing.LARGEST_BYTES, "it loads slowly; see --shrink of scripts/draw_documents.py"
+    assert path.stat().st_size <= drawing.LARGEST_BYTES, "it loads slowly; see --shrink of docs/draw_documents.py"
 
 
 def test_every_drawing_is_on_a_page():

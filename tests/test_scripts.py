@@ -1,4 +1,4 @@
-"""The scripts, through their main, on small inputs."""
+"""The programs beside the package, through their main, on small inputs."""
 
 import importlib.util
 import json
@@ -14,11 +14,13 @@ import tetopt
 from tetopt.engine.cost import RunSize, cost_model, memory_terms, once_terms, swept_terms
 from tetopt.geometry.topology import components
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = [ROOT / "scripts", ROOT / "tests" / "benchmarks", ROOT / "docs"]
 
 
 def script(name):
-    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    path = next(folder / f"{name}.py" for folder in FOLDERS if (folder / f"{name}.py").exists())
+    spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -62,9 +64,12 @@ def test_mesh_brain_mr_bad_input(tmp_path, capsys):
 def test_benchmark(tmp_path, capsys):
     """It runs, and what it prints is what it writes."""
     tetopt.save_image(tmp_path / "b.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=2.0))
-    code = script("benchmark").main([str(tmp_path / "b.nii.gz"), "-o", str(tmp_path / "b.json"), "--quick"])
-    assert code == 0
+    words = [str(tmp_path / "b.nii.gz"), "--quick", "-o"]
+    assert script("benchmark").main([*words, str(tmp_path / "b.json")]) == 0
     rows = json.loads((tmp_path / "b.json").read_text())
+    assert f"{rows['graded'][0]['seconds']:.1f} s, peak" in capsys.readouterr().out
+    assert script("benchmark_kernels").main([*words, str(tmp_path / "k.json")]) == 0
+    rows = json.loads((tmp_path / "k.json").read_text())
     printed = capsys.readouterr().out
     assert f"E_D {rows['bar']['E_D_of_initial']:.3f} of initial" in printed
     assert rows["sampling_over_find_simplex"] > 0.0
@@ -89,7 +94,7 @@ def test_fingerprints(tmp_path, capsys):
 
 def test_choose_sizes(tmp_path, monkeypatch, capsys):
     """Every mesh is measured; a tighter largest edge leaves more E_D and follows the displacement better."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     out = tmp_path / "sizes.json"
     words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--largest", "1", "inf"]
     assert script("choose_sizes").main(words) == 0
@@ -105,7 +110,7 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
 
 def test_choose_average(tmp_path, monkeypatch, capsys):
     """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     out = tmp_path / "averages.json"
     words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--modes", "uniform"]
     assert script("choose_average").main(words) == 0

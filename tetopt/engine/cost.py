@@ -1,8 +1,8 @@
 """What a run of `tetopt mesh` takes, seconds and memory, by sizes that are known before it.
 
 Both are sums of terms, each a size times what one of it costs. The costs are fitted to measured runs of whole
-processes by `scripts/fit_cost.py` (non-negative least squares of relative errors) and stand in `cost.toml` beside this
-module, with the machine, its speed, and the errors of runs that were left out of the fit.
+processes by `tests/benchmarks/fit_cost.py` (non-negative least squares of relative errors) and stand in `cost.toml`
+beside this module, with the machine, its speed, and the errors of runs that were left out of the fit.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a volume by blocks and a mesh by parts take: time of each stage, memory of each process; a table and a file.
 
-    python scripts/benchmark_blocks.py 1024 --folder /scratch -o bench_blocks.json
+    python tests/benchmarks/benchmark_blocks.py 1024 --folder /scratch -o bench_blocks.json
 
 Of EDGE^3 voxels of 16 bits, painted chunk by chunk if the folder has none yet: 400 ellipsoids of all sizes, whose radii
 are such that small ones have as much surface as large ones, and noise. Nodes are in proportion to EDGE^2, as surfaces

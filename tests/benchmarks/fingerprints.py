@@ -1,6 +1,6 @@
 """Checksums of meshes over the ground that tetopt covers: the same before and after a change that is to change nothing.
 
-    python scripts/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only NAME ...]
+    python tests/benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only NAME ...]
 
 Each row is one run of the command: the sha256 of its points and cells, and of its whole file. They are the same on any
 number of threads. Between kinds of processors, or versions of numpy and scipy, last digits may differ: then write the

@@ -4,7 +4,7 @@ Phantoms, and volumes of yours, are meshed uniformly, graded with several larges
 itself: graded by the reference's own strain, sqrt(E) times its part along the push, which no mesher knows. That mesh
 says what nodes in other places could do at most. Each is compressed and compared with a voxel grid's solution.
 
-    python scripts/choose_sizes.py -o sizes.json [T1.nii.gz ...]
+    python tests/benchmarks/choose_sizes.py -o sizes.json [T1.nii.gz ...]
 """
 
 from __future__ import annotations

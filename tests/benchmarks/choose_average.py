@@ -5,7 +5,7 @@ in all; each mesh is compressed with each average and compared with the voxels' 
 "points" is no average, but the modulus of the voxel at each Gauss point of a cell: what a solver could have that reads
 the image itself. The last rows are geometric means over images, meshes and nu, relative to the first average.
 
-    python scripts/choose_average.py -o averages.json [T1.nii.gz ...]
+    python tests/benchmarks/choose_average.py -o averages.json [T1.nii.gz ...]
 """
 
 from __future__ import annotations

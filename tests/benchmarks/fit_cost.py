@@ -1,6 +1,6 @@
 """What runs of `tetopt mesh` take, measured, and the model of it fitted: the package's `cost.toml`.
 
-    python scripts/fit_cost.py -o cost.toml --rows rows.jsonl
+    python tests/benchmarks/fit_cost.py -o cost.toml --rows rows.jsonl
 
 Whole processes, one after the other, pictures and numbers written as a cohort has them; half an hour. Images are those
 of nilearn's wheel and made of them; where TETOPT_DATA names a folder with the development data, real ones, too. Some
@@ -337,7 +337,7 @@ def model_text(model: dict[str, dict[str, float]], rows: Sequence[Row]) -> str:
     n_known = sum(row.threads == 1 and not row.is_left_out for row in rows)
     n_left_out = sum(row.threads == 1 and row.is_left_out for row in rows)
     lines = [
-        "# What a run of `tetopt mesh` costs; written by scripts/fit_cost.py, see tetopt.engine.cost for the terms.",
+        "# What a run of `tetopt mesh` costs; terms: tetopt.engine.cost; by tests/benchmarks/fit_cost.py",
         f"# {datetime.datetime.now(datetime.UTC):%Y-%m-%d}, tetopt {tetopt.__version__}, {processor()}, "
         f"{os.cpu_count()} cores, Python {platform.python_version()}",
         f"# fitted to {n_known} runs; the errors are those of {TRUSTED_FRACTION:.0%} of {n_left_out} others",

@@ -1,8 +1,8 @@
 """The drawings of the documents, from small runs on phantoms: docs/pictures is a folder of them.
 
-    python scripts/draw_documents.py -o docs/pictures --force
-    python scripts/draw_documents.py -o docs/pictures --force --only flip
-    python scripts/draw_documents.py -o docs/pictures --force --shrink compared/slices.png
+    python docs/draw_documents.py -o docs/pictures --force
+    python docs/draw_documents.py -o docs/pictures --force --only flip
+    python docs/draw_documents.py -o docs/pictures --force --shrink compared/slices.png
 
 With `--shrink` pictures of other commands are kept in a third of their bytes, with few colours; `COMMANDS` says which
 command draws each.
@@ -42,7 +42,7 @@ COMMANDS = {
     "demo.png": "tetopt compare T1.nii.gz -o compared --nodes 15000 --pipelines tetopt-uniform,tetopt,pytetwild,"
     " then --shrink of slices.png",
     "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
-    "organ.png": "python scripts/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
+    "organ.png": "python docs/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
     "tradeoff.png": "tetopt compare T1.nii.gz -o compared --nodes 5000 --tradeoff",
     "view.png": "tetopt view brain.vtu --image T1.nii.gz --html look.html, photographed in a browser",
 }

@@ -1,6 +1,6 @@
 """Build the wheel and the archive of sources, check them, install each into a fresh environment, and run it there.
 
-Usage: python scripts/dist.py FOLDER, which gets the two files. Needs an index of packages, as pip has it.
+Usage: python .ci/dist.py FOLDER, which gets the two files. Needs an index of packages, as pip has it.
 """
 
 import os

@@ -2,7 +2,7 @@
 
 The README's picture of a brain, `docs/pictures/organ.png`, is one. Image and labels are of the same voxels.
 
-    python scripts/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz -o organ.png
+    python docs/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz -o organ.png
 """
 
 from __future__ import annotations
