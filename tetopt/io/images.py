@@ -49,7 +49,6 @@ Bounds = Sequence[tuple[int | None, int | None]]
 
 OUTPUT_SUFFIXES = (".nii", ".nii.gz")
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
-_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
 
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
@@ -472,13 +471,11 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
         if path.is_dir():
             return read_dicom_folder(path, volume)
     name = check_beginning(path)
-    if name.endswith(_NIBABEL_SUFFIXES):
-        return _read_nibabel(path, volume, notes)
-    if name.endswith(tuple(ITK_READERS)):
-        return read_itk(path, volume)
-    if name.endswith(PICTURE_SUFFIXES):
-        return read_picture(path, volume)
-    raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
+    for suffix, read in READERS.items():
+        if name.endswith(suffix):
+            return read(path, volume, notes)
+    known = ", ".join((*READERS, ZARR_SUFFIX))
+    raise InputError(f"unknown kind of image file; expected {known}, or a folder of DICOM files")
 
 
 def check_beginning(path: Path) -> str:
@@ -528,6 +525,14 @@ def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDA
     if data.ndim == 2:
         return data, _plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
+
+
+# By suffix; each gives data and affine of a path and a volume, with notes.
+READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArray[np.float64]]]] = {
+    **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
+    **dict.fromkeys(ITK_READERS, read_itk),
+    **dict.fromkeys(PICTURE_SUFFIXES, read_picture),
+}
 
 
 def nibabel_voxels(

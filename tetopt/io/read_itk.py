@@ -35,7 +35,7 @@ _SAME_PLACE_MM = 1e-3  # slices nearer to each other are of one place
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 
 
-def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Data and affine of a file; InputError without the path before it."""
     _check_installed()
     size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
