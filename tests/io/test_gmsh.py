@@ -34,6 +34,7 @@ from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
 from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples
 
+pytestmark = pytest.mark.usefixtures("here")
 WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
 NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10}
@@ -245,16 +246,6 @@ def test_facet_sets_are_groups(version, n, bins):
         smaller |= set(of_set[name])
 
 
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize("n", [3, 2])
-def test_no_facet_is_there_twice(version, n):
-    model = sample_model(n)
-    expected = set().union(*(each_once(facet_triples(model.mesh.cells, rows)) for rows in model.sets.facets.values()))
-    read, first = Read(WRITERS[version](model)), len(model.mesh.cells) + 1
-    assert sorted(read.elements) == list(range(1, first + len(expected)))
-    assert each_once(read.nodes(range(first, first + len(expected)))) == sorted(expected)
-
-
 @pytest.mark.parametrize("n", [3, 2])
 def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
     model = sample_model(n)
@@ -444,14 +435,6 @@ def test_names_that_are_taken(version, kind):
         WRITERS[version](model)
 
 
-def test_a_set_cannot_be_called_unnamed_where_cells_are():
-    model = unlabelled(sample_model())._replace(
-        materials=None, sets=Sets({"unnamed": np.array([[0, 0]])}, {"a": np.array([5])})
-    )
-    with pytest.raises(InputError, match=r"^set unnamed: "):
-        gmsh41(model)
-
-
 def test_names_that_cell_data_have():
     model = sample_model()
     model = model._replace(sets=model.sets._replace(cells={"mean": np.array([1])}))
@@ -502,18 +485,6 @@ def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, mo
     for name, rows in model.sets.facets.items():
         triples = facet_triples(back.mesh.cells, back.sets.facets[name])
         assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
-
-
-def test_what_was_read_can_be_written_again(tmp_path):
-    save_model(tmp_path / "a.msh", sample_model(3))
-    back = load_mesh(tmp_path / "a.msh")
-    again = sample_model(3)._replace(mesh=back.mesh, cell_data=back.cell_data, sets=back.sets)
-    table = materials(back.cell_data["young"], back.cell_data["nu"], len(back.mesh.cells))
-    save_model(tmp_path / "b.msh", again._replace(materials=table, loads=()))
-    for name in ("young", "nu"):
-        np.testing.assert_array_equal(
-            np.sort(load_mesh(tmp_path / "b.msh").cell_data[name]), np.sort(back.cell_data[name])
-        )
 
 
 @pytest.mark.parametrize("version", WRITERS)
