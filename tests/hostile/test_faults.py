@@ -23,10 +23,7 @@ from models import sample_image
 import tetopt
 import tetopt.job.meshing
 
-pytestmark = [
-    pytest.mark.deep,
-    pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc"),
-]
+pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
 
 ERRORS = {"full": errno.ENOSPC, "refused": errno.EACCES, "broken": errno.EIO}
 MESH = ["mesh", "{in}/a.nii.gz", "--spacing", "8", "--iterations", "1"]

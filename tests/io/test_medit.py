@@ -9,14 +9,13 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, each_once, labelled_model, quadratic_model, sample_model, young_of
+from models import each_once, labelled_model, quadratic_model, sample_model
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.medit import medit
 from tetopt.model.model import elements as model_elements
-from tetopt.model.model import in_units
 from tetopt.model.sets import Sets, facet_triples
 
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
@@ -103,23 +102,6 @@ def test_the_reference_is_the_label(n):
     assert set(refs[labels == 3]) == {2001, 2002}
     assert np.array_equal(read.cells_of("label_3"), np.flatnonzero(labels == 3))
     assert set(read.refs[KEYWORD[n - 1]]) == {1999}
-
-
-def test_constants_image_and_loads_are_in_comments():
-    model = in_units(sample_model(), "MPa")
-    read = Read(medit(model))
-    young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
-    for line in read.comments:
-        if match := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
-            young[read.cells_of(match[1])], nu[read.cells_of(match[1])] = float(match[2]), float(match[3])
-    assert np.array_equal(young, young_of(model))
-    assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
-    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
-    assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
-    assert any(
-        line.startswith("cell data") and line.endswith(", ".join(name for name in model.cell_data if name != "label"))
-        for line in read.comments
-    )
 
 
 @pytest.mark.parametrize("n", [3, 2])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from models import each_once, labelled_model, quadratic_model, sample_model
 
-from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.mfem import mfem
@@ -142,12 +141,6 @@ def test_order_2_adds_the_middle_of_each_edge_once(n):
     expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
     assert sorted(read.middles.tolist()) == sorted(expected.tolist())
     assert "point data, which this format has no place for: displacement, warmth" in read.comments
-
-
-def test_refused():
-    model = sample_model()
-    with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
-        mfem(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
 
 @pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])

@@ -332,10 +332,7 @@ def cropped(image: Image, bounds: Bounds) -> Image:
     >>> small.shape, small.to_world([0, 0])
     ((20, 50), array([10.,  0.]))
     """
-    ranges = checked_bounds(image.shape, bounds)
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return Image(image.data[tuple(slice(*r) for r in ranges)], affine)
+    return image.box(*zip(*checked_bounds(image.shape, bounds), strict=True))
 
 
 def parse_crop(text: str) -> list[tuple[int | None, int | None]]:

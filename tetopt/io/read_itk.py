@@ -68,7 +68,11 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
     import SimpleITK as sitk
 
     try:
-        reader = _reader_of(path)
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(path)
+        reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
+        reader.ReadImageInformation()
+        _check_components(reader.GetNumberOfComponents())
         size = reader.GetSize()
         index = volume_index(size[3:], volume)
         if index:
@@ -77,18 +81,6 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
         return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
     except RuntimeError as error:
         raise _in_words(error) from error
-
-
-def _reader_of(path: str) -> Any:
-    """A reader that has read the header."""
-    import SimpleITK as sitk
-
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(path)
-    reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
-    reader.ReadImageInformation()
-    _check_components(reader.GetNumberOfComponents())
-    return reader
 
 
 def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
