@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import gzip
 import hashlib
+import io
 import logging
 import math
 import os
@@ -31,6 +31,7 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
+from tetopt.io.readback import save_checked
 from tetopt.io.volumes import (
     DAMAGED_FILE,
     TOO_LONG,
@@ -41,7 +42,7 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
-from tetopt.system.files import check_suffix, written_whole
+from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
 
 Bounds = Sequence[tuple[int | None, int | None]]
@@ -53,6 +54,7 @@ _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
 _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
+GZIP_LEVEL = 1  # as nibabel packs
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
@@ -215,7 +217,7 @@ def save_image(path: str | Path, image: Image) -> None:
     InputError
         A name that ends otherwise; as `save_zarr`.
     OSError
-        As `tetopt.system.files.written_whole`, or the file reads back with another head or cut off.
+        As `tetopt.io.readback.save_checked`.
 
     Examples
     --------
@@ -234,27 +236,13 @@ def save_image(path: str | Path, image: Image) -> None:
     kind = nibabel.Nifti1Image if max(image.shape) <= MOST_OF_NIFTI_1 else nibabel.Nifti2Image
     file = kind(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
-    with written_whole(path) as temporary:
-        nibabel.save(file, temporary.absolute())  # as in `_nibabel_file`
-        _check_written(temporary, file)
-
-
-def _check_written(path: Path, file: nibabel.Nifti1Image) -> None:
-    """OSError if the file is not what was written, as far as its head and its length tell."""
-    back = type(file).from_filename(path)
-    n_bytes = path.stat().st_size
+    whole = file.to_bytes()
     if path.suffix.lower() == ".gz":
-        with path.open("rb") as packed:
-            packed.seek(-4, os.SEEK_END)
-            n_bytes = int.from_bytes(packed.read(), "little")  # unpacked, below 2^32
-    length = int(type(file).header_class.single_vox_offset) + file.header.get_data_dtype().itemsize * int(
-        np.prod(file.shape)
-    )
-    is_same = back.shape == file.shape and np.array_equal(
-        back.affine.astype(np.float32), file.affine.astype(np.float32)
-    )
-    if not is_same or n_bytes != length % 2**32:
-        raise OSError(errno.EIO, "what was written reads back otherwise; is the disk sound?")
+        packed = io.BytesIO()
+        with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as stream:
+            stream.write(whole)
+        whole = packed.getvalue()
+    save_checked(path, whole)
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:
