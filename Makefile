@@ -81,7 +81,7 @@ test-random: $(VENV)/.test
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow
 
-# 10,000 hostile inputs, of the seed in HOSTILE_SEED; the suite runs 200. What ended badly is kept, and its folder printed.
+# 10,000 hostile inputs, of the seed in HOSTILE_SEED; `.ci/run` has 40. What ended badly is kept, and its folder printed.
 test-hostile: $(VENV)/.test
 	PYTHONPATH=.:tests PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m hostile --inputs 10000 --workers 2
 	$(TESTED) -q -s --no-header tests/hostile/test_faults.py tests/hostile/test_kills.py

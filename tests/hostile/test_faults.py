@@ -23,7 +23,7 @@ from models import sample_image
 import tetopt
 import tetopt.job.meshing
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")
+pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
 
 ERRORS = {"full": errno.ENOSPC, "refused": errno.EACCES, "broken": errno.EIO}
 MESH = ["mesh", "{in}/a.nii.gz", "--spacing", "8", "--iterations", "1"]
@@ -190,8 +190,8 @@ def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is
 def test_every_step_may_fail(name, is_replacing, inputs, tmp_path, runs, table, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     command, outputs = COMMANDS[name]
-    # A mesh takes a second: every third of its steps, others with old files than without; `make test-hostile` has all.
-    steps = slice(1 + is_replacing, 1000, 3) if name.startswith("mesh") else slice(1, 1000)
+    # A mesh takes a second: every tenth of its steps, others with old files than without; `make test-hostile` has all.
+    steps = slice(1 + is_replacing, 1000, 10) if name.startswith("mesh") else slice(1, 1000)
     _every_fault(name, command, outputs, inputs, tmp_path, runs, table, "full", is_replacing, steps)
 
 
@@ -245,7 +245,7 @@ def _every_allocation(name, inputs, tmp_path, runs, table, stride):
 
 def test_arrays_may_not_fit(inputs, tmp_path, runs, table, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    _every_allocation("mesh, numbers", inputs, tmp_path, runs, table, 23)
+    _every_allocation("mesh, numbers", inputs, tmp_path, runs, table, 71)
 
 
 @pytest.mark.slow

@@ -11,9 +11,12 @@ from hostile.judge import GOOD
 from hostile.sabotage import DEEDS
 
 ROOT = Path(__file__).resolve().parents[2]
-N_INPUTS = 200  # of `make test-hostile`'s 10,000
+N_INPUTS = 40  # of `make test-hostile`'s 10,000
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not Path("/proc/self").exists(), reason="forks, reads /proc")
+pytestmark = [
+    pytest.mark.deep,
+    pytest.mark.skipif(not hasattr(os, "fork") or not Path("/proc/self").exists(), reason="forks, reads /proc"),
+]
 
 
 def run(module, *words):

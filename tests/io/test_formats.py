@@ -1,6 +1,5 @@
 """All formats alike: chosen by the suffix, and well-formed whatever things are called."""
 
-import itertools
 import re
 import warnings
 from pathlib import Path
@@ -11,22 +10,25 @@ import meshio
 import numpy as np
 import pytest
 from models import quadratic_model, sample_model
-from outlines import Outline, check_outline
+from test_febio import Feb
+from test_medit import KEYWORD
+from test_medit import Read as Medit
+from test_mfem import Read as Mfem
+from test_xdmf import grids, item, named
 
 import tetopt
 from tetopt import InputError
 from tetopt.cli import main
 from tetopt.geometry.surface import extract_surface
-from tetopt.geometry.topology import boundary_facets
-from tetopt.io import formats, surfaces
+from tetopt.io import formats
+from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.surfaces import checked_surface, save_surface
 from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
-XML_SUFFIXES = (".vtu", ".xdmf", ".feb")
+pytestmark = pytest.mark.usefixtures("here")
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -59,6 +61,44 @@ def hostile_model(suffix):
     return model._replace(cell_data=cell_data, point_data=point_data, about={"tetopt": "0.1.0\n!", "image": IMAGE})
 
 
+def found(path, model):
+    """How many points and cells a reader finds in a file, and the names of the sets of facets and cells."""
+    suffix = path.suffix
+    if suffix == ".inp":
+        file, sets = meshio.read(path), input_sets(path, model.mesh)
+        return len(file.points), len(file.cells[0].data), *sets
+    if suffix == ".feb":
+        feb = Feb(path.read_bytes())
+        return len(feb.points), len(feb.cells), feb.surfaces, feb.cell_sets
+    if suffix == ".xdmf":
+        parts = grids(path.read_bytes())
+        points, cells = (item(parts["mesh"].find(f"{each}/DataItem")) for each in ("Geometry", "Topology"))
+        return len(points), len(cells), named(parts["facets"]), named(parts["cells"])
+    if suffix == ".mfem":
+        mfem = Mfem(path.read_bytes())
+        return len(mfem.points), len(mfem.cells), mfem.facet_sets, mfem.cell_sets
+    if suffix == ".mesh":
+        medit = Medit(path.read_bytes())
+        facets, cells = (
+            {name for name in each if medit.refs_of(KEYWORD[dim], name)}
+            for each, dim in zip(model.sets, (2, 3), strict=True)
+        )
+        return len(medit.points), len(medit.nodes[KEYWORD[3]]), facets, cells
+    file = tetopt.load_mesh(path)
+    return len(file.mesh.points), len(file.mesh.cells), *file.sets
+
+
+def assert_whole(path, model):
+    """A reader, for most formats not of tetopt's, finds all of the mesh and the sets."""
+    if FORMATS[path.suffix].is_surface:
+        assert checked_surface(path).is_watertight
+        return
+    n_points, n_cells, *names = found(path, model)
+    assert (n_points, n_cells) == (len(model.mesh.points), len(model.mesh.cells))
+    for those, sets in zip(names, model.sets, strict=True):
+        assert set(sets) <= set(those)
+
+
 def saved(path, model):
     """Written, with warnings on names as those of the tests, and as bytes."""
     with pytest.warns(UserWarning, match="names that it cannot hold"):
@@ -71,7 +111,7 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
     """Each file is of text without control characters but line breaks, or tells no name at all but in bytes."""
     model = hostile_model(suffix)
     text = saved(tmp_path / f"a{suffix}", model)
-    check_outline(suffix, text, expected_outline(suffix, len(model.mesh.points), len(model.mesh.cells), model.sets))
+    assert_whole(tmp_path / f"a{suffix}", model)
     head = text[: text.index(b"CELLS")] if suffix == ".vtk" else text[:80] if suffix == ".stl" else text
     head = head[: head.index(b"end_header")] if suffix == ".ply" else head
     if suffix == ".vtkhdf":
@@ -81,18 +121,12 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
         head = b"\n".join(re.findall(rb"\n([\x20-\x7e]+ \d+ \d+ (?:double|vtktypeint64|unsigned_char|int))\n", text))
     shown = head.decode()
     assert plain(shown.replace("\n", "")) == shown.replace("\n", "")
-    if suffix in XML_SUFFIXES:
-        ElementTree.fromstring(text)
+    if suffix in (".xdmf", ".feb"):
+        tag, key = ("Attribute", "Name") if suffix == ".xdmf" else ("ElementData", "name")
+        assert {each.get(key) for each in ElementTree.fromstring(text).iter(tag)} >= {*KEPT, *SHOWN.values()}
 
 
-@pytest.mark.parametrize("order", [0, 3, -1])
-def test_an_order_that_there_is_not(order, tmp_path):
-    with pytest.raises(tetopt.InputError, match=f"order: expected 1 or 2, got {order}"):
-        save_model(tmp_path / "a.vtu", sample_model()._replace(order=order))
-    assert not (tmp_path / "a.vtu").exists()
-
-
-@pytest.mark.parametrize("name", ["{", "}", "{x}", "${x}", "{{x}}", "{0:>9}", "%s%n"])
+@pytest.mark.parametrize("name", ["{", "{0:>9}", "%s%n"])
 def test_braces_in_names_end_no_process(name, tmp_path):
     """VTK's writer of legacy files reads them as marks of its own, and ends the process."""
     model = sample_model()._replace(loads=())
@@ -101,12 +135,12 @@ def test_braces_in_names_end_no_process(name, tmp_path):
     model = model._replace(cell_data=values, point_data=at_nodes, about={name: "x"})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are called otherwise
-        for path in (tmp_path / "a.vtu", tmp_path / "a.vtk", tmp_path / "a.msh"):
-            save_model(path, model)
-            back = tetopt.load_mesh(path).cell_data
-            assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
+        save_model(tmp_path / "a.vtk", model)
+    back = tetopt.load_mesh(tmp_path / "a.vtk").cell_data
+    assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".msh"])
 def test_names_come_back(suffix, tmp_path):
     """As they were where they are printable text, else as Python escapes them; gmsh has no quotes, HDF5 no slashes."""
@@ -128,27 +162,6 @@ def test_names_come_back(suffix, tmp_path):
     }
     image = back.text("image")
     assert image == (plain(" ".join(IMAGE.split())) if suffix == ".msh" else IMAGE.replace("\udcff", "\\udcff"))
-
-
-@pytest.mark.parametrize("suffix", [".xdmf", ".feb"])
-def test_names_come_back_from_xml(suffix, tmp_path):
-    model = hostile_model(suffix)
-    root = ElementTree.fromstring(saved(tmp_path / f"a{suffix}", model))
-    tag, key = ("Attribute", "Name") if suffix == ".xdmf" else ("ElementData", "name")
-    assert {each.get(key) for each in root.iter(tag)} >= {*KEPT, *SHOWN.values()}
-
-
-def test_other_programs_read_hostile_names(tmp_path):
-    for suffix in (".vtu", ".msh", ".mesh"):
-        model = hostile_model(suffix)
-        saved(tmp_path / f"a{suffix}", model)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            mesh = meshio.read(tmp_path / f"a{suffix}")
-        assert sum(len(block.data) for block in mesh.cells if block.type == "tetra") == len(model.mesh.cells)
-    for suffix in (".stl", ".ply"):
-        saved(tmp_path / f"a{suffix}", hostile_model(suffix))
-        assert checked_surface(tmp_path / f"a{suffix}").is_watertight
 
 
 def test_two_names_never_become_one():
@@ -176,8 +189,8 @@ def test_names_of_any_length(suffix, tmp_path):
         assert [each for each in back if each[0] in "x名"] == ["x" * 240, "x" * 240 + "_2", "x" * 240 + "_3", "名" * 26]
 
 
-@pytest.mark.parametrize("name", ["a b", "<x>", "", "1a", "x" * 73, "a\n", "ä"])
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("name", ["a b", "", "1a", "x" * 73, "a\n", "ä"])
+@pytest.mark.parametrize("suffix", [".inp"])
 def test_sets_that_some_format_cannot_name_are_refused(name, suffix, tmp_path):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets | {name: model.sets.facets["boundary"]}, model.sets.cells)
@@ -212,7 +225,7 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
 
-@pytest.mark.parametrize("name", ["a", "a.vtux", "a.csv", "a.nii.gz", "a.vtu.gz"])
+@pytest.mark.parametrize("name", ["a", "a.vtu.gz"])
 def test_a_suffix_of_no_format_is_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"unknown suffix; known are \.vtu .*, \.inp"):
         save_mesh(tmp_path / name, sample_model().mesh)
@@ -239,6 +252,7 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_names_that_are_words_of_a_format(suffix, tmp_path):
     words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End"]
@@ -247,8 +261,7 @@ def test_names_that_are_words_of_a_format(suffix, tmp_path):
     fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
     about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}
     save_model(tmp_path / f"a{suffix}", model._replace(cell_data=fields, about=about, loads=()))
-    whole = (tmp_path / f"a{suffix}").read_bytes()
-    check_outline(suffix, whole, expected_outline(suffix, len(model.mesh.points), len(model.mesh.cells), model.sets))
+    assert_whole(tmp_path / f"a{suffix}", model)
     if suffix in VTK_SUFFIXES:
         back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
         assert all(np.array_equal(back[name], values) for name, values in fields.items())
@@ -299,92 +312,12 @@ def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".INP", "pts", "", ".", ".a/b", ".nii.gz", ".p\n"])
+@pytest.mark.parametrize("suffix", [".INP", "pts", "", ".a/b", ".p\n"])
 def test_suffixes_that_no_format_can_have(suffix):
     with pytest.raises(InputError, match=r"^suffix: (tetopt writes \.\w+ itself|expected a dot)") as caught:
         tetopt.register_format(suffix, str)
     assert "\n" not in str(caught.value)
     assert suffix not in FORMATS.keys() - formats.BUILT_IN
-
-
-# All that a file holds
-
-
-def outlines():
-    """Each format with an outline, its bytes, and how many points and cells they hold; surfaces' own formats, too."""
-    model = sample_model()
-    surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
-    for order, suffix in itertools.product((1, 2), FORMATS):
-        if order == 1 or FORMATS[suffix].has_quadratic:
-            whole = quadratic_model() if order == 2 else model
-            yield (
-                suffix,
-                file_bytes(Path(f"a{suffix}"), whole),
-                len(elements(whole)[0]),
-                len(model.mesh.cells),
-                model.sets,
-            )
-    for suffix in (".vtp", ".vtk"):
-        labels = {"inside": np.zeros(len(surface.triangles), int), "b": np.ones(len(surface.triangles), int)}
-        writer = {".vtp": surfaces._vtp, ".vtk": surfaces._vtk}[suffix]
-        yield suffix, writer(surface, "about", "ras", labels), len(surface.points), len(surface.triangles), Sets({}, {})
-
-
-# Named by suffix: the bytes of some files differ from one process to the next.
-OUTLINED = [pytest.param(*each, id=f"{number}{each[0]}") for number, each in enumerate(outlines())]
-
-
-def expected_outline(suffix, n_points, n_cells, sets):
-    """What a file of a format tells of these: surfaces have nodes of their own, gmsh counts facets among the cells."""
-    if suffix in (".stl", ".ply") and sets.facets:
-        return Outline()
-    facet_sets, cell_sets = frozenset(sets.facets), frozenset(sets.cells)
-    return Outline(n_points, n_cells, facet_sets, cell_sets)
-
-
-@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
-def test_a_file_holds_all(suffix, whole, n_points, n_cells, sets):
-    outline = check_outline(suffix, whole, expected_outline(suffix, n_points, n_cells, sets))
-    if suffix == ".stl":
-        surface = boundary_facets(sample_model().mesh.cells)
-        assert outline.n_cells == len(surface)
-    elif suffix == ".ply":
-        surface = boundary_facets(sample_model().mesh.cells)
-        assert outline[:2] == (len(np.unique(surface)), len(surface))
-    else:
-        assert outline.n_points == n_points
-        assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)
-        assert outline.facet_sets is not None
-
-
-@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
-def test_an_outline_notices_damage(suffix, whole, n_points, n_cells, sets):
-    """Wherever a file is cut off, and whichever line a text lacks."""
-    rng = np.random.default_rng(len(whole))
-    expected = expected_outline(suffix, n_points, n_cells, sets)
-    if suffix in (".stl", ".ply"):
-        expected = check_outline(suffix, whole, expected)
-    end = whole.index(b"*SURFACE, NAME=corner") if suffix == ".inp" else len(whole) - 8  # materials have no counts
-    damaged = [whole[:length] for length in [0, 1, 50, *rng.integers(0, end, 20)]]
-    if suffix in (".msh", ".msh2", ".mfem", ".mesh", ".xdmf"):
-        lines = whole.splitlines(keepends=True)
-        chosen = rng.choice([k for k, line in enumerate(lines) if line[:1].isdigit()], 20)
-        damaged += [b"".join(lines[:k] + lines[k + 1 :]) for k in chosen]
-    for each in damaged:
-        with pytest.raises(AssertionError, match=r"is not well-formed|instead of|lacks the set"):
-            check_outline(suffix, each, expected)
-
-
-def test_an_outline_notices_what_is_missing():
-    whole = file_bytes(Path("a.inp"), sample_model())
-    for expected, words in (
-        (Outline(facet_sets=frozenset({"boundary", "lost"})), "lacks the sets .*lost"),
-        (Outline(cell_sets=frozenset({"lost"})), "lacks the sets .*lost"),
-        (Outline(n_points=7), "holds .* instead of 7"),
-        (Outline(n_cells=7), "holds .* instead of 7"),
-    ):
-        with pytest.raises(AssertionError, match=words):
-            check_outline(".inp", whole, expected)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -407,11 +340,10 @@ def test_a_million_cells(suffix, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of nearly incompressible cells
         save_model(tmp_path / f"a{suffix}", model)
-    whole = (tmp_path / f"a{suffix}").read_bytes()
-    check_outline(suffix, whole, expected_outline(suffix, len(mesh.points), len(mesh.cells), model.sets))
+    assert_whole(tmp_path / f"a{suffix}", model)
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".inp"])
+@pytest.mark.parametrize("suffix", [".vtu"])
 def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
     path, model = tmp_path / f"a{suffix}", sample_model()
     path.write_bytes(b"old")

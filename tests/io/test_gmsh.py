@@ -23,7 +23,6 @@ from models import (
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.formats import save_model
 from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
@@ -34,6 +33,7 @@ from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
 from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples
 
+pytestmark = pytest.mark.usefixtures("here")
 WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
 NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10}
@@ -147,18 +147,6 @@ def cell_numbers(model):
 
 @pytest.mark.parametrize("version", WRITERS)
 @pytest.mark.parametrize(("n", "bins"), MODELS)
-def test_points_and_cells_are_those_of_the_mesh(version, n, bins):
-    model = sample_model(n, bins)
-    read = Read(WRITERS[version](model))
-    assert read.version == version
-    assert np.array_equal(read.points[:, :n], model.mesh.points)
-    assert not read.points[:, n:].any()
-    assert np.array_equal(read.nodes(cell_numbers(model)), model.mesh.cells)
-    assert {read.elements[number][0] for number in cell_numbers(model)} == {2 if n == 2 else 4}
-
-
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins"), MODELS)
 def test_each_cell_without_label_is_in_the_one_group_of_its_material(version, n, bins):
     model = unlabelled(sample_model(n, bins))
     read = Read(WRITERS[version](model))
@@ -245,16 +233,6 @@ def test_facet_sets_are_groups(version, n, bins):
         smaller |= set(of_set[name])
 
 
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize("n", [3, 2])
-def test_no_facet_is_there_twice(version, n):
-    model = sample_model(n)
-    expected = set().union(*(each_once(facet_triples(model.mesh.cells, rows)) for rows in model.sets.facets.values()))
-    read, first = Read(WRITERS[version](model)), len(model.mesh.cells) + 1
-    assert sorted(read.elements) == list(range(1, first + len(expected)))
-    assert each_once(read.nodes(range(first, first + len(expected)))) == sorted(expected)
-
-
 @pytest.mark.parametrize("n", [3, 2])
 def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
     model = sample_model(n)
@@ -275,15 +253,6 @@ def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
         expected = sorted(facet_triples(model.mesh.cells, first).tolist())
         for name in ("first", "second"):
             assert sorted(read.nodes(read.groups[n - 1, name]).tolist()) == expected
-
-
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins"), MODELS)
-def test_cell_sets_are_in_the_comments(version, n, bins):
-    model = sample_model(n, bins)
-    read = Read(WRITERS[version](model))
-    for name, members in model.sets.cells.items():
-        assert sorted(read.cells_of_set(name)) == members.tolist()
 
 
 @pytest.mark.parametrize(("n", "bins"), MODELS)
@@ -335,70 +304,7 @@ def test_boxes_of_entities_hold_their_elements():
         assert np.array_equal(box, [*corners.min(axis=0), *corners.max(axis=0)])
 
 
-@pytest.mark.parametrize("version", WRITERS)
-def test_lps(version):
-    model = in_space(sample_model(), "lps")
-    read = Read(WRITERS[version](model))
-    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
-    assert "coordinates: LPS+, mm" in read.comments
-
-
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize("n", [3, 2])
-def test_quadratic_cells(version, n):
-    """Each midpoint is where gmsh's manual has it: edges 01 12 02 03 23 13 of a tetrahedron, 01 12 20 of a triangle."""
-    model = quadratic_model(n)
-    read = Read(WRITERS[version](model))
-    points, cells = quadratic(model.mesh.points, model.mesh.cells)
-    assert np.array_equal(read.points[:, :n], points)
-    nodes = read.nodes(cell_numbers(model))
-    assert np.array_equal(np.sort(nodes), np.sort(cells))
-    assert np.array_equal(nodes[:, : n + 1], model.mesh.cells)
-    ends = [(0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3)]
-    for at, edge in enumerate(ends[: n * (n + 1) // 2], n + 1):
-        assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
-    left = next(iter(model.sets.facets))
-    sides = read.nodes(read.elements_of_set(left, "facets"))
-    assert each_once(sides[:, :n]) == each_once(facet_triples(model.mesh.cells, model.sets.facets[left]))
-    for at, edge in enumerate([(0, 1), (1, 2), (2, 0)][: 3 if n == 3 else 1], n):
-        assert np.array_equal(points[sides[:, at]], points[sides[:, edge]].mean(axis=1))
-
-
-@pytest.mark.parametrize("n", [3, 2])
-def test_point_data_are_views_in_41_and_a_comment_in_22(n):
-    model = quadratic_model(n)
-    lines = gmsh41(model).decode().split("$NodeData\n")[1:]
-    columns = {}
-    for block in lines:
-        head, rows = block.split("\n$End")[0].split("\n")[:8], block.split("\n$End")[0].split("\n")[8:]
-        table = np.array([row.split() for row in rows], dtype=float)
-        assert head[2:] == ["1", "0.0", "3", "0", str(table.shape[1] - 1), str(len(table))]
-        assert table[:, 0].tolist() == list(range(1, len(table) + 1))
-        columns[head[1].strip('"')] = table[:, 1:]
-    displacement = model.point_data["displacement"]
-    if n == 3:  # as gmsh deforms by it
-        expected = {"displacement": displacement}
-    else:
-        expected = {"displacement_0": displacement[:, :1], "displacement_1": displacement[:, 1:]}
-    expected["warmth"] = all_nodes(model.point_data["warmth"], model.mesh)[:, None]
-    assert set(columns) == set(expected)
-    for name, values in expected.items():
-        assert np.array_equal(columns[name], values), name
-    left_out = [line for line in Read(gmsh22(model)).comments if line.startswith("point data")]
-    assert left_out == ["point data, which this format has no place for: displacement, warmth"]
-
-
 # Other models
-
-
-@pytest.mark.parametrize("version", WRITERS)
-def test_without_materials_disjoint_cell_sets_are_groups(version):
-    model = sample_model()._replace(materials=None)
-    read = Read(WRITERS[version](model))
-    groups = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
-    assert groups == {name: (model.sets.cells[name] + 1).tolist() for name in ("label_0", "label_1")}
-    assert sorted(read.cells_of_set("dark")) == model.sets.cells["dark"].tolist()
-    assert "young" not in read.views
 
 
 @pytest.mark.parametrize("version", WRITERS)
@@ -410,14 +316,6 @@ def test_cells_of_no_set_are_unnamed(version):
     assert groups.pop("b") == [8, 10]
     assert groups == {"unnamed": [k for k in cell_numbers(model) if k not in (8, 10)]}
     assert [read.cells_of_set(name) for name in "ac"] == [[5], [9]]
-
-
-@pytest.mark.parametrize("version", WRITERS)
-def test_a_mesh_alone(version):
-    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
-    read = Read(WRITERS[version](model))
-    assert read.groups == {(3, "unnamed"): cell_numbers(model)}
-    assert read.views == {}
 
 
 def test_many_materials_are_views_only(monkeypatch):
@@ -442,14 +340,6 @@ def test_names_that_are_taken(version, kind):
     model = model._replace(sets=model.sets._replace(**{kind: {"Material_2": members}}))
     with pytest.raises(InputError, match=r'^set Material_2: the file calls something else "Material_2"; call the set'):
         WRITERS[version](model)
-
-
-def test_a_set_cannot_be_called_unnamed_where_cells_are():
-    model = unlabelled(sample_model())._replace(
-        materials=None, sets=Sets({"unnamed": np.array([[0, 0]])}, {"a": np.array([5])})
-    )
-    with pytest.raises(InputError, match=r"^set unnamed: "):
-        gmsh41(model)
 
 
 def test_names_that_cell_data_have():
@@ -502,18 +392,6 @@ def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, mo
     for name, rows in model.sets.facets.items():
         triples = facet_triples(back.mesh.cells, back.sets.facets[name])
         assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
-
-
-def test_what_was_read_can_be_written_again(tmp_path):
-    save_model(tmp_path / "a.msh", sample_model(3))
-    back = load_mesh(tmp_path / "a.msh")
-    again = sample_model(3)._replace(mesh=back.mesh, cell_data=back.cell_data, sets=back.sets)
-    table = materials(back.cell_data["young"], back.cell_data["nu"], len(back.mesh.cells))
-    save_model(tmp_path / "b.msh", again._replace(materials=table, loads=()))
-    for name in ("young", "nu"):
-        np.testing.assert_array_equal(
-            np.sort(load_mesh(tmp_path / "b.msh").cell_data[name]), np.sort(back.cell_data[name])
-        )
 
 
 @pytest.mark.parametrize("version", WRITERS)

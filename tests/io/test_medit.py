@@ -9,14 +9,13 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, each_once, labelled_model, quadratic_model, sample_model, unlabelled, young_of
+from models import each_once, labelled_model, quadratic_model, sample_model
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.medit import medit
 from tetopt.model.model import elements as model_elements
-from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import Sets, facet_triples
 
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
@@ -87,12 +86,6 @@ def test_boundary_faces_out(n):
     assert sorted(Read(medit(model)).facets_of("boundary").tolist()) == sorted(faces.tolist())
 
 
-def test_references_are_the_materials_where_no_set_divides_one():
-    model = sample_model()
-    read = Read(medit(unlabelled(model)._replace(sets=model.sets._replace(cells={}))))
-    assert np.array_equal(read.refs["Tetrahedra"], model.materials.of_cell + 1)
-
-
 @pytest.mark.parametrize("n", [3, 2])
 def test_the_reference_is_the_label(n):
     """And that of each part of a label that a set divides has a number behind all others."""
@@ -109,37 +102,6 @@ def test_the_reference_is_the_label(n):
     assert set(refs[labels == 3]) == {2001, 2002}
     assert np.array_equal(read.cells_of("label_3"), np.flatnonzero(labels == 3))
     assert set(read.refs[KEYWORD[n - 1]]) == {1999}
-
-
-def test_constants_image_and_loads_are_in_comments():
-    model = in_units(sample_model(), "MPa")
-    read = Read(medit(model))
-    young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
-    for line in read.comments:
-        if match := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
-            young[read.cells_of(match[1])], nu[read.cells_of(match[1])] = float(match[2]), float(match[3])
-    assert np.array_equal(young, young_of(model))
-    assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
-    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
-    assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
-    assert any(
-        line.startswith("cell data") and line.endswith(", ".join(name for name in model.cell_data if name != "label"))
-        for line in read.comments
-    )
-
-
-def test_lps():
-    read = Read(medit(in_space(sample_model(), "lps")))
-    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
-    assert "coordinates: LPS+, mm" in read.comments
-
-
-def test_a_mesh_alone():
-    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
-    read = Read(medit(model))
-    assert (read.refs["Tetrahedra"] == 1).all()
-    assert len(read.nodes["Triangles"]) == 0
-    assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
 
 
 @pytest.mark.parametrize("n", [3, 2])

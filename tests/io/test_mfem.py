@@ -1,17 +1,15 @@
 """MFEM files: read by a parser after MFEM's documentation and by PyMFEM; all of the model is there, bit by bit."""
 
-import re
+from collections import deque
 
 import numpy as np
 import pytest
-from models import ABOUT, each_once, labelled_model, quadratic_model, sample_model, unlabelled, young_of
+from models import each_once, labelled_model, quadratic_model, sample_model
 
-from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.mfem import mfem
 from tetopt.model.materials import materials
-from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import Sets, facet_triples
 
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
@@ -24,33 +22,33 @@ class Read:
     def __init__(self, raw):
         lines = [line for line in raw.decode().split("\n") if line]
         self.comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
-        self.lines = [line for line in lines if not line.startswith("#")]
-        assert self.lines.pop(0) == "MFEM mesh v1.3"
+        self.lines = deque(line for line in lines if not line.startswith("#"))
+        assert self.lines.popleft() == "MFEM mesh v1.3"
         self.expect("dimension")
-        self.n = int(self.lines.pop(0))
+        self.n = int(self.lines.popleft())
         self.attributes, self.cells = self.elements("elements", self.n)
         self.cell_sets = self.sets("attribute_sets")
         self.facet_attributes, self.facets = self.elements("boundary", self.n - 1)
         self.facet_sets = self.sets("bdr_attribute_sets")
         self.expect("vertices")
-        count, self.middles = int(self.lines.pop(0)), np.empty((0, self.n))
+        count, self.middles = int(self.lines.popleft()), np.empty((0, self.n))
         if self.lines[0] != "nodes":
-            assert int(self.lines.pop(0)) == self.n
+            assert int(self.lines.popleft()) == self.n
         else:  # a grid function that is saved node by node
             head = ["nodes", "FiniteElementSpace", f"FiniteElementCollection: H1_{self.n}D_P2", f"VDim: {self.n}"]
-            assert [self.lines.pop(0) for _ in range(5)] == [*head, "Ordering: 1"]
-            values = np.array([self.lines.pop(0).split() for _ in range(len(self.lines) - 1)], dtype=float)
+            assert [self.lines.popleft() for _ in range(5)] == [*head, "Ordering: 1"]
+            values = np.array([self.lines.popleft().split() for _ in range(len(self.lines) - 1)], dtype=float)
             self.points, self.middles = values[:count], values[count:]
         if not len(self.middles):
-            self.points = np.array([self.lines.pop(0).split() for _ in range(count)], dtype=float)
-        assert self.lines == ["mfem_mesh_end"]
+            self.points = np.array([self.lines.popleft().split() for _ in range(count)], dtype=float)
+        assert list(self.lines) == ["mfem_mesh_end"]
 
     def expect(self, keyword):
-        assert self.lines.pop(0) == keyword
+        assert self.lines.popleft() == keyword
 
     def elements(self, keyword, dim):
         self.expect(keyword)
-        rows = [self.lines.pop(0).split() for _ in range(int(self.lines.pop(0)))]
+        rows = [self.lines.popleft().split() for _ in range(int(self.lines.popleft()))]
         assert {row[1] for row in rows} <= {GEOMETRY[dim]}
         table = np.array(rows, dtype=int).reshape(-1, dim + 3)
         return table[:, 0], table[:, 2:]
@@ -59,10 +57,10 @@ class Read:
         """Attributes by name: a name in quotes, how many, and which on any number of lines."""
         self.expect(keyword)
         sets = {}
-        for _ in range(int(self.lines.pop(0))):
-            name, count, attributes = self.lines.pop(0).strip('"'), int(self.lines.pop(0)), []
+        for _ in range(int(self.lines.popleft())):
+            name, count, attributes = self.lines.popleft().strip('"'), int(self.lines.popleft()), []
             while len(attributes) < count:
-                attributes += map(int, self.lines.pop(0).split())
+                attributes += map(int, self.lines.popleft().split())
             assert len(attributes) == count
             sets[name] = attributes
         return sets
@@ -100,12 +98,6 @@ def test_boundary_elements_face_out(n):
     assert sorted(Read(mfem(model)).facets_of("boundary").tolist()) == sorted(faces.tolist())
 
 
-def test_attributes_are_the_materials_where_no_set_divides_one():
-    model = sample_model()
-    read = Read(mfem(unlabelled(model)._replace(sets=model.sets._replace(cells={}))))
-    assert np.array_equal(read.attributes, model.materials.of_cell + 1)
-
-
 @pytest.mark.parametrize("n", [3, 2])
 @pytest.mark.parametrize("has_sets", [True, False])
 def test_the_attribute_is_the_label(n, has_sets):
@@ -138,41 +130,6 @@ def test_parts_of_divided_labels_have_attributes_behind_all_others():
     assert not any(line.startswith("label 0 is") for line in divided.comments)  # two attributes are
 
 
-def test_constants_and_what_attributes_mean_are_in_comments():
-    model = in_units(sample_model(), "MPa")
-    read = Read(mfem(model))
-    young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
-    for line in read.comments:
-        if match := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
-            young[read.cells_of(match[1])], nu[read.cells_of(match[1])] = float(match[2]), float(match[3])
-    assert np.array_equal(young, young_of(model))
-    assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
-    for what, sets in (("attribute", read.cell_sets), ("boundary attribute", read.facet_sets)):
-        for attribute in {k for attributes in sets.values() for k in attributes}:
-            names = [name for name, attributes in sets.items() if attribute in attributes]
-            assert f"{what} {attribute}: {' '.join(names)}" in read.comments
-    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
-    assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
-    assert any(
-        line.startswith("cell data") and line.endswith(", ".join(name for name in model.cell_data if name != "label"))
-        for line in read.comments
-    )
-
-
-def test_lps():
-    read = Read(mfem(in_space(sample_model(), "lps")))
-    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
-    assert "coordinates: LPS+, mm" in read.comments
-
-
-def test_a_mesh_alone():
-    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
-    read = Read(mfem(model))
-    assert (read.attributes == 1).all()
-    assert (len(read.facets), read.cell_sets, read.facet_sets) == (0, {}, {})
-    assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
-
-
 @pytest.mark.parametrize("n", [3, 2])
 def test_order_2_adds_the_middle_of_each_edge_once(n):
     model = quadratic_model(n)
@@ -184,12 +141,6 @@ def test_order_2_adds_the_middle_of_each_edge_once(n):
     expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
     assert sorted(read.middles.tolist()) == sorted(expected.tolist())
     assert "point data, which this format has no place for: displacement, warmth" in read.comments
-
-
-def test_refused():
-    model = sample_model()
-    with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
-        mfem(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
 
 @pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])

@@ -69,7 +69,7 @@ def assert_refused(path, match, **options):
 
 
 @pytest.mark.parametrize("fmt", [2, 3])
-@pytest.mark.parametrize("dtype", ["<i2", ">u2", "u1", "<f4", "<f8"])
+@pytest.mark.parametrize("dtype", [">u2", "<f4"])
 def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
     voxels = ramp(6, 5, 4, dtype=dtype)
     place = transforms([300.0, 200.0, 100.0], [3.0, 2.0, 1.0])
@@ -83,8 +83,8 @@ def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
     assert image.voxels.chunks == (4, 4, 4)
 
 
-@pytest.mark.parametrize("scaling", [(0.5, -3.0), (1.0, 0.0), (1e-3, 1e5)])
-@pytest.mark.parametrize("dtype", [">i2", "<u1", "<i4", ">f4", "<f8"])
+@pytest.mark.parametrize("scaling", [(0.5, -3.0), (1.0, 0.0)])
+@pytest.mark.parametrize("dtype", [">i2", "<f8"])
 @pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
 def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
     file = kind(ramp(7, 6, 5, 2, dtype=dtype), np.array(OBLIQUE), dtype=np.dtype(dtype))
@@ -101,20 +101,7 @@ def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
     np.testing.assert_array_equal(part.affine, other.affine)
 
 
-def test_a_real_file_is_as_read_whole(data_dir, tmp_path):
-    packed = nibabel.load(data_dir / "mr_abdomen_slab_3mm.nii.gz")
-    nibabel.save(packed, tmp_path / "a.nii")
-    assert_as_read_whole(tmp_path / "a.nii")
-
-
-def assert_as_read_whole(path, **options):
-    image, whole = open_stored(path, **options), load_image(path, **options)
-    assert image.affine.tobytes() == whole.affine.tobytes()
-    assert image.box((0, 0, 0), image.shape).data.tobytes() == whole.data.tobytes()
-    assert type(image.read((0, 0, 0), (1, 2, 3))) is np.ndarray
-
-
-@pytest.mark.parametrize("name", ["a.nrrd", "a.nhdr", "a.mha", "A.MHD"])
+@pytest.mark.parametrize("name", ["a.nrrd", "A.MHD"])
 def test_formats_that_are_read_whole_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"NRRD0005" if "n" in name else b"ObjectType = Image")
     assert_refused(tmp_path / name, r"is read whole, not in parts; convert it to \.zarr or uncompressed \.nii first")
@@ -421,6 +408,7 @@ BAD_METADATA = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", BAD_METADATA)
 def test_metadata_that_is_of_no_image(tmp_path, case):
     path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"))
@@ -429,6 +417,7 @@ def test_metadata_that_is_of_no_image(tmp_path, case):
     assert_refused(path, match)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"zarr_format": 9}', "\\0", '{"a": ' + "[" * 100_000])
 @pytest.mark.parametrize("name", ["zarr.json", "0/zarr.json", "0/.zarray", ".zgroup"])
 def test_metadata_that_is_damaged(tmp_path, name, text):

@@ -18,6 +18,7 @@ def test_what_is_not_printed_is_shown():
     assert plain("\u2028\u2029\u202e\u2066\ufeff\udcff\udc80") == r"\u2028\u2029\u202e\u2066\ufeff\udcff\udc80"
 
 
+@pytest.mark.full
 def test_of_all_letters_only_harmless_ones_are_left():
     """Whatever comes in, what comes out can be encoded, and breaks, erases or turns no line."""
     shown = plain("".join(map(chr, range(sys.maxunicode + 1))))

@@ -11,6 +11,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from children import arrays, crash, echo, endless, greedy, limits, stumbling, writing
 
 import tetopt
 from tetopt.cli import main
@@ -28,6 +29,7 @@ from tetopt.model.mappings import load_mapping
 from tetopt.system import budget, incoming
 from tetopt.system.incoming import json_of, text_of, toml_of
 
+pytestmark = pytest.mark.deep
 POINTS = struct.pack("<12d", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
 PACKED = zlib.compress(POINTS)
 
@@ -44,46 +46,8 @@ def refused(load, path, words):
 # The child that reads
 
 
-def echo(path, value):
-    return {"path": path, "value": value, "turned": np.arange(24).reshape(2, 3, 4).T, "texts": np.array(["ä", "b\0c"])}
-
-
-def arrays(path):
-    return [np.empty((0, 3)), np.array(7.5), np.array([True]), np.arange(6, dtype=">i2").reshape(2, 3), np.float32(2.0)]
-
-
-def crash(path):
-    os.abort()
-
-
-def endless(path):
-    while True:
-        pass
-
-
-def greedy(path):
-    return np.ones(2**40)
-
-
-def stumbling(path):
-    raise KeyError("what\nis this")
-
-
-def writing(path):
-    os.write(1, b"VTK says what it pleases")
-    print("and Python too")
-    return 1
-
-
-def limits(path):
-    import resource  # not on Windows
-
-    return [resource.getrlimit(getattr(resource, f"RLIMIT_{name}"))[0] for name in ("CPU", "CORE", "AS")]
-
-
 @pytest.fixture
-def some_file(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+def some_file(tmp_path):
     path = tmp_path / "a file ä.vtu"
     path.write_bytes(b"x")
     return path
@@ -255,20 +219,20 @@ def nrrd(dimension="3", sizes="3 4 5", kind="uchar", more="", encoding="raw", da
 ITK_BOMBS = {
     "good.mha": (mha(), None),
     "good.nrrd": (nrrd(), None),
-    "axes.mha": (mha(ndims="-1"), "expected 1 to 8 axes, got -1"),
-    "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
-    "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
-    "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
-    "huge.mha": (mha(sizes="32767 32767 32767"), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
-    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "tells of 32767 x"),
-    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "tells of 3 x 4 x 5 voxels, 6e.10 bytes"),
-    "type.mha": (mha(kind="MET_OTHER"), "voxels of type MET_OTHER"),
+    "axes.mha": (mha(ndims="-1"), "expected 1 to 8 axes, with a size each, got -1 axes and 3 sizes"),
+    "fewer.mha": (mha(sizes="3 4"), "got 3 axes and 2 sizes"),
+    "minus.mha": (mha(sizes="3 4 -5"), "sizes 3 4 -5"),
+    "huge.mha": (mha(sizes="32767 32767 32767"), "its 32767 x 32767 x 32767 voxels: needs about"),
+    "short.mha": (mha(sizes="300 300 300"), "damaged"),
+    "packed.mha": (mha(sizes="300 300 300", more="CompressedData = True\n"), "tells of 300 x 300 x 300 voxels"),
+    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "needs about|got 999999999"),
+    "type.mha": (mha(kind="MET_OTHER"), "damaged"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
-    "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
-    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "tells of 99999999999 x 9 x 9 voxels"),
-    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "tells of 32767 x"),
-    "long.nrrd": (nrrd(sizes="9" * 5000), "expected 3 sizes"),
+    "axes.nrrd": (nrrd(dimension="-1"), "got -1 axes"),
+    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "its 99999999999 x 9 x 9 voxels: needs about"),
+    "packed.nrrd": (nrrd(sizes="300 300 300", encoding="gzip"), "damaged"),
+    "long.nrrd": (nrrd(sizes="9" * 5000), "sizes 9999"),
 }
 
 

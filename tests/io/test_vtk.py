@@ -16,6 +16,8 @@ from tetopt.io.vtk import model_grid, vtu
 from tetopt.model.loads import load_words
 from tetopt.model.sets import nodes_of
 
+pytestmark = pytest.mark.usefixtures("here")
+
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk", "vtkhdf"])
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])  # a slice has a plane of its own
@@ -101,15 +103,6 @@ def test_point_data_of_another_length_is_refused():
             InputError, match=r"^point data: expected a row for each of \d+ corner nodes or of \d+ in all"
         ):
             vtu(model._replace(point_data={"odd": values}))
-
-
-def test_a_linear_file_has_the_corners_point_data(tmp_path):
-    model = quadratic_model(3)
-    save_model(tmp_path / "a.vtu", model._replace(order=1))
-    back, n_corners = load_mesh(tmp_path / "a.vtu"), len(model.mesh.points)
-    assert back.order == 1
-    np.testing.assert_array_equal(back.point_data["displacement"], model.point_data["displacement"][:n_corners])
-    np.testing.assert_array_equal(back.point_data["warmth"], model.point_data["warmth"])
 
 
 def test_results_are_turned_and_scaled_with_the_file(tmp_path):
@@ -215,14 +208,6 @@ def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(tmp_p
     assert set(note.split(": ")[1].split(", ")) == {*sample_model(3).sets.facets, *sample_model(3).sets.cells}
 
 
-def test_a_file_that_another_program_has_only_saved_keeps_its_sets(tmp_path):
-    save_model(tmp_path / "a.vtu", sample_model(3))
-    pyvista.read(tmp_path / "a.vtu").save(tmp_path / "b.vtu")
-    back = load_mesh(tmp_path / "b.vtu")
-    np.testing.assert_array_equal(back.sets.facets["left"], sample_model(3).sets.facets["left"])
-    assert back.notes == ()
-
-
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -301,25 +286,9 @@ def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
         assert other.cell_data[name][0].dtype.newbyteorder("=") == kind
 
 
-def test_cell_data_other_than_numbers_are_left_out(tmp_path):
-    grid = sample_model(3).mesh.to_pyvista({"k": np.ones(len(sample_model(3).mesh.cells))})
-    grid.cell_data["names"] = np.array(["a"] * grid.n_cells)
-    grid.save(tmp_path / "a.vtu")
-    back = load_mesh(tmp_path / "a.vtu")
-    assert list(back.cell_data) == ["k"]
-    assert back.notes == ("cell data left out, as they are no numbers: names",)
-
-
 @pytest.mark.parametrize("values", [np.array([1.5]), np.empty(0)])
 def test_a_space_that_is_no_text_is_not_looked_at(tmp_path, values):
     grid = sample_model(3).mesh.to_pyvista()
     grid.field_data["space"] = values
     grid.save(tmp_path / "a.vtu")
     assert load_mesh(tmp_path / "a.vtu").space == "ras"
-
-
-def test_without_materials_and_loads(tmp_path):
-    save_model(tmp_path / "a.vtu", sample_model(3)._replace(materials=None, loads=()))
-    back = load_mesh(tmp_path / "a.vtu")
-    assert not {"young", "nu", "material"} & set(back.cell_data)
-    assert not {"units", "loads"} & set(back.field_data)

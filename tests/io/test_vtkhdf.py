@@ -6,15 +6,15 @@ import time
 import h5py
 import numpy as np
 import pytest
-import pyvista
 from models import quadratic_model, sample_model
 
-from tetopt.cli import main
 from tetopt.errors import InputError
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
 from tetopt.io.vtk import vtu
 from tetopt.io.vtkhdf import hdf_arrays, vtkhdf
+
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def in_parts(model, n_parts=3):
@@ -44,15 +44,6 @@ def test_it_gives_back_the_same_mesh(tmp_path, make, n):
     (tmp_path / "a.vtu").write_bytes(vtu(model))
     save_model(tmp_path / "a.vtkhdf", model)
     assert same(load_mesh(tmp_path / "a.vtkhdf"), load_mesh(tmp_path / "a.vtu"))
-
-
-def test_other_readers_see_one_piece(tmp_path):
-    model = sample_model()
-    save_model(tmp_path / "a.vtkhdf", model)
-    grid = pyvista.read(tmp_path / "a.vtkhdf")
-    np.testing.assert_array_equal(grid.points, model.mesh.points)
-    np.testing.assert_array_equal(grid.cells_dict[10], model.mesh.cells)
-    np.testing.assert_array_equal(grid.field_data["facets:boundary"], model.sets.facets["boundary"])
 
 
 def test_the_same_model_is_the_same_bytes():
@@ -270,15 +261,6 @@ def test_a_file_cut_off_and_cells_beyond_their_points(file_path):
     with pytest.raises(InputError, match="damaged, or not an HDF5 file") as caught:
         load_mesh(file_path)
     assert "\n" not in str(caught.value)
-
-
-def test_commands_take_it(file_path, tmp_path, capfd):
-    """Both ways, and nothing is lost on the way back."""
-    assert main(["convert", str(file_path), str(tmp_path / "b.vtu")]) == 0
-    assert main(["convert", str(tmp_path / "b.vtu"), str(tmp_path / "b.vtkhdf")]) == 0
-    assert same(load_mesh(tmp_path / "b.vtkhdf"), load_mesh(tmp_path / "b.vtu"))
-    assert main(["quality", str(tmp_path / "b.vtkhdf")]) == 0
-    assert "192 cells" in " ".join(capfd.readouterr().out.split())
 
 
 def test_without_h5py_a_line_says_what_to_install(file_path, monkeypatch):

@@ -69,6 +69,7 @@ def refused(path, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("kind", ["2 blosc", "3 blosc", "3 shards"])
 @pytest.mark.parametrize(
     ("offset", "number"),
@@ -84,6 +85,7 @@ def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
     refused(tmp_path / "a.zarr", "its voxels .* cannot be read .*chunk")
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("name", PACKERS)
 def test_chunks_that_are_cut(tmp_path, name):
     chunk = written(tmp_path / "a.zarr", 2, compressors=packer(name))
@@ -102,6 +104,7 @@ BOMBS = {
 }
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("name", PACKERS)
 def test_a_bomb_takes_no_memory(name):
     """32 MB for 128 bytes."""

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any
 
 import numpy as np
@@ -34,6 +35,7 @@ BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfol
 BYTES_A_VALUE_BYTE = 4  # of memory for each that the voxels take by the header: the library's copy, numpy's, turned
 LEAST_SECONDS = 60.0  # for any file, also on a busy machine
 SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of what the slowest of these files are read at
+ARRAY_MARK = "\0array"  # which no file has for a name
 DEFLATE_RATIO = 1032  # of a byte of zlib's: it packs no tighter; a header that tells of more is wrong
 
 
@@ -100,70 +102,41 @@ def read_apart(
     return answer["value"]
 
 
-# The way back: one line of JSON, in which arrays are numbers of those that follow.
+# The way back: one line of JSON, behind it the arrays that it has marks for, in their order.
 
 
 def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
     arrays: list[NDArray] = []
-    tree = _packed(answer, arrays)
-    heads = [[each.dtype.str, each.shape] for each in arrays]
-    stream.write(json.dumps({"tree": tree, "arrays": heads}).encode() + b"\n")
+
+    def marked(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"{type(value).__name__} cannot be sent")
+        arrays.append(value)
+        return {ARRAY_MARK: True}
+
+    stream.write(json.dumps(answer, default=marked).encode() + b"\n")
     for each in arrays:
-        stream.write(_bytes_of(each))
+        np.lib.format.write_array(SimpleNamespace(write=stream.write), each, allow_pickle=False)
     stream.flush()
-
-
-def _bytes_of(array: NDArray) -> memoryview:
-    """The memory of a C-ordered array."""
-    return memoryview(array.reshape(-1).view(np.uint8).data if array.nbytes else b"")
-
-
-def _packed(value: Any, arrays: list[NDArray]) -> Any:
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind not in "buifcU":
-            raise TypeError(f"array of {value.dtype}")
-        # A volume of ITK's is turned: it is sent as it lies, and turned again.
-        is_turned = value.flags.f_contiguous and not value.flags.c_contiguous
-        arrays.append(
-            np.ascontiguousarray(value.T if is_turned else value).reshape(value.shape[:: -1 if is_turned else 1])
-        )
-        return {"turned" if is_turned else "array": len(arrays) - 1}
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, dict):
-        return {"dict": [[key, _packed(item, arrays)] for key, item in value.items()]}
-    if isinstance(value, list | tuple):
-        return [_packed(item, arrays) for item in value]
-    return value
 
 
 def _received(stream: IO[bytes]) -> dict[str, Any] | None:
     """What the child sent; None if it did not come to its end."""
-    line = stream.readline()
+    line, pipe = stream.readline(), SimpleNamespace(read=stream.read)
+
+    def unmarked(table: dict[str, Any]) -> Any:
+        if table.get(ARRAY_MARK) is not True:
+            return table
+        return np.lib.format.read_array(pipe, allow_pickle=False)
+
     if not line.endswith(b"\n"):
         return None
-    head = json.loads(line)
-    arrays = []
-    for dtype, shape in head["arrays"]:
-        array = np.empty(shape, dtype)
-        raw = _bytes_of(array)
-        while len(raw):
-            n_read = stream.readinto(raw)  # type: ignore[attr-defined]
-            if not n_read:
-                return None
-            raw = raw[n_read:]
-        arrays.append(array)
-    return _unpacked(head["tree"], arrays)
-
-
-def _unpacked(tree: Any, arrays: list[NDArray]) -> Any:
-    if isinstance(tree, list):
-        return [_unpacked(item, arrays) for item in tree]
-    if not isinstance(tree, dict):
-        return tree
-    if "dict" in tree:
-        return {key: _unpacked(item, arrays) for key, item in tree["dict"]}
-    return arrays[tree["array"]] if "array" in tree else arrays[tree["turned"]].T
+    try:
+        return json.loads(line, object_hook=unmarked)
+    except ValueError:  # the pipe ends within an array
+        return None
 
 
 # In the child

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_columns, check_one_step, named_materials
+from tetopt.io.tags import as_columns, named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
-from tetopt.model.loads import Load, facet_forces, spring_constants
+from tetopt.model.loads import Load, count_of_steps, facet_forces, spring_constants
 from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
 
@@ -123,7 +123,8 @@ def _check(model: Model) -> None:
         raise InputError("febio: a part needs a material; give a modulus mapping (`young`)")
     if taken := {YOUNG_MAP, NU_MAP, DENSITY_MAP, DEAD_FORCES} & model.cell_data.keys():
         raise InputError(f'febio: a map that the file needs is called "{min(taken)}"; call the cell data otherwise')
-    check_one_step(model, "febio")
+    if (count := count_of_steps(model.loads)) > 1:  # each would go on from the one before
+        raise InputError(f"febio: a file is one step, got {count}; write one for each, with its loads alone")
 
 
 def _parts(model: Model) -> list[_Part]:
@@ -136,17 +137,10 @@ def _parts(model: Model) -> list[_Part]:
             for name, values in ((NU_MAP, nu), (DENSITY_MAP, density))
         )
         return [_Part(ALL_CELLS, ALL_CELLS, YOUNG_MAP, ratio, mass, np.arange(len(of_cell)))]
-    names = named_materials(model)
+    rows = zip(named_materials(model), young.tolist(), nu.tolist(), density.tolist(), strict=True)
     return [
-        _Part(
-            f"cells of {names[k]}",
-            names[k],
-            repr(float(young[k])),
-            repr(float(nu[k])),
-            repr(float(density[k])),
-            members,
-        )
-        for k, members in enumerate(cells_of(model.materials))
+        _Part(f"cells of {name}", name, repr(young_of), repr(nu_of), repr(density_of), members)
+        for (name, young_of, nu_of, density_of), members in zip(rows, cells_of(model.materials), strict=True)
         if len(members)
     ]
 
@@ -209,12 +203,11 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
     for name, values in model.cell_data.items():
         fields[name] = (values.ravel() if values.size == len(values) else values).astype(np.float64)
     fields = as_columns(fields)
-    if model.materials is not None and parts[0].young == YOUNG_MAP:
-        fields[YOUNG_MAP] = model.materials.young[model.materials.of_cell]
-        if parts[0].nu == NU_MAP:
-            fields[NU_MAP] = model.materials.nu[model.materials.of_cell]
-        if parts[0].density == DENSITY_MAP:
-            fields[DENSITY_MAP] = mass_densities(model)[model.materials.of_cell]
+    assert model.materials is not None
+    young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+    stated = {YOUNG_MAP: (parts[0].young, young), NU_MAP: (parts[0].nu, nu)}
+    stated[DENSITY_MAP] = parts[0].density, mass_densities(model)
+    fields |= {name: values[of_cell] for name, (word, values) in stated.items() if word == name}
     data = [
         f'<ElementData name="{xml_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"

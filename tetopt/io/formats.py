@@ -168,9 +168,8 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     ...     tetopt.save_model(name, model)
     """
     path = Path(path)
-    kind, ready = format_of(path), _ready(path, model, space, units)
-    save_checked(path, _encoded(kind.write(ready)))
-    is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
+    save_checked(path, file_bytes(path, model, space=space, units=units))
+    is_for_solver = not format_of(path).is_surface and path.suffix.lower() not in VTK_SUFFIXES
     if is_for_solver and (words := locking_words(model)):
         warn(f"{path}: {words}")
 
@@ -236,10 +235,7 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     InputError
         As `save_model`.
     """
-    return _encoded(format_of(path).write(_ready(path, model, space, units)))
-
-
-def _encoded(whole: bytes | str) -> bytes:
+    whole = format_of(path).write(_ready(path, model, space, units))
     return whole.encode() if isinstance(whole, str) else whole
 
 

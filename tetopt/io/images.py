@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import gzip
 import hashlib
+import io
 import logging
 import math
 import os
@@ -31,6 +31,7 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
+from tetopt.io.readback import save_checked
 from tetopt.io.volumes import (
     DAMAGED_FILE,
     TOO_LONG,
@@ -41,7 +42,7 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
-from tetopt.system.files import check_suffix, written_whole
+from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
 
 Bounds = Sequence[tuple[int | None, int | None]]
@@ -49,11 +50,11 @@ Bounds = Sequence[tuple[int | None, int | None]]
 
 OUTPUT_SUFFIXES = (".nii", ".nii.gz")
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
-_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
 
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
 _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
+GZIP_LEVEL = 1  # as nibabel packs
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
@@ -216,7 +217,7 @@ def save_image(path: str | Path, image: Image) -> None:
     InputError
         A name that ends otherwise; as `save_zarr`.
     OSError
-        As `tetopt.system.files.written_whole`, or the file reads back with another head or cut off.
+        As `tetopt.io.readback.save_checked`.
 
     Examples
     --------
@@ -235,27 +236,13 @@ def save_image(path: str | Path, image: Image) -> None:
     kind = nibabel.Nifti1Image if max(image.shape) <= MOST_OF_NIFTI_1 else nibabel.Nifti2Image
     file = kind(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
-    with written_whole(path) as temporary:
-        nibabel.save(file, temporary.absolute())  # as in `_nibabel_file`
-        _check_written(temporary, file)
-
-
-def _check_written(path: Path, file: nibabel.Nifti1Image) -> None:
-    """OSError if the file is not what was written, as far as its head and its length tell."""
-    back = type(file).from_filename(path)
-    n_bytes = path.stat().st_size
+    whole = file.to_bytes()
     if path.suffix.lower() == ".gz":
-        with path.open("rb") as packed:
-            packed.seek(-4, os.SEEK_END)
-            n_bytes = int.from_bytes(packed.read(), "little")  # unpacked, below 2^32
-    length = int(type(file).header_class.single_vox_offset) + file.header.get_data_dtype().itemsize * int(
-        np.prod(file.shape)
-    )
-    is_same = back.shape == file.shape and np.array_equal(
-        back.affine.astype(np.float32), file.affine.astype(np.float32)
-    )
-    if not is_same or n_bytes != length % 2**32:
-        raise OSError(errno.EIO, "what was written reads back otherwise; is the disk sound?")
+        packed = io.BytesIO()
+        with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as stream:
+            stream.write(whole)
+        whole = packed.getvalue()
+    save_checked(path, whole)
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:
@@ -333,10 +320,7 @@ def cropped(image: Image, bounds: Bounds) -> Image:
     >>> small.shape, small.to_world([0, 0])
     ((20, 50), array([10.,  0.]))
     """
-    ranges = checked_bounds(image.shape, bounds)
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return Image(image.data[tuple(slice(*r) for r in ranges)], affine)
+    return image.box(*zip(*checked_bounds(image.shape, bounds), strict=True))
 
 
 def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
@@ -472,13 +456,11 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
         if path.is_dir():
             return read_dicom_folder(path, volume)
     name = check_beginning(path)
-    if name.endswith(_NIBABEL_SUFFIXES):
-        return _read_nibabel(path, volume, notes)
-    if name.endswith(tuple(ITK_READERS)):
-        return read_itk(path, volume)
-    if name.endswith(PICTURE_SUFFIXES):
-        return read_picture(path, volume)
-    raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
+    for suffix, read in READERS.items():
+        if name.endswith(suffix):
+            return read(path, volume, notes)
+    known = ", ".join((*READERS, ZARR_SUFFIX))
+    raise InputError(f"unknown kind of image file; expected {known}, or a folder of DICOM files")
 
 
 def check_beginning(path: Path) -> str:
@@ -528,6 +510,14 @@ def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDA
     if data.ndim == 2:
         return data, _plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
+
+
+# By suffix; each gives data and affine of a path and a volume, with notes.
+READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArray[np.float64]]]] = {
+    **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
+    **dict.fromkeys(ITK_READERS, read_itk),
+    **dict.fromkeys(PICTURE_SUFFIXES, read_picture),
+}
 
 
 def nibabel_voxels(

@@ -17,7 +17,7 @@ PICTURE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 MOST_PIXELS = 2**30  # of a frame: 32,768 squared, more than any slide scanner's file that is a plain picture
 
 
-def read_picture(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+def read_picture(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Grey values (rows, columns) and affine of a frame; InputError without the path before it."""
     data = read_apart(_pixels_of, path, volume, value_bytes=MOST_PIXELS, library="Pillow")
     return data, np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, data.shape[0] - 1.0], [0.0, 0.0, 1.0]])

@@ -35,7 +35,7 @@ _SAME_PLACE_MM = 1e-3  # slices nearer to each other are of one place
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 
 
-def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Data and affine of a file; InputError without the path before it."""
     _check_installed()
     size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
@@ -68,7 +68,11 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
     import SimpleITK as sitk
 
     try:
-        reader = _reader_of(path)
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(path)
+        reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
+        reader.ReadImageInformation()
+        _check_components(reader.GetNumberOfComponents())
         size = reader.GetSize()
         index = volume_index(size[3:], volume)
         if index:
@@ -77,18 +81,6 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
         return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
     except RuntimeError as error:
         raise _in_words(error) from error
-
-
-def _reader_of(path: str) -> Any:
-    """A reader that has read the header."""
-    import SimpleITK as sitk
-
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(path)
-    reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
-    reader.ReadImageInformation()
-    _check_components(reader.GetNumberOfComponents())
-    return reader
 
 
 def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:

@@ -24,7 +24,7 @@ from tetopt.geometry.topology import facets
 from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
-from tetopt.model.loads import count_of_steps, load_words
+from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described
 from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, MOST_LETTERS, free_name, label_set_names
 
@@ -263,12 +263,6 @@ def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
     lower = {name.lower() for name in names}
     if both := [name for name in taken if name.lower() in lower]:
         raise InputError(f'set {both[0]}: the file calls something else "{both[0]}"; call the set otherwise')
-
-
-def check_one_step(model: Model, form: str) -> None:
-    """InputError for several steps, where each would go on from the one before."""
-    if (count := count_of_steps(model.loads)) > 1:
-        raise InputError(f"{form}: a file is one step, got {count}; write one for each, with its loads alone")
 
 
 def remarks(model: Model) -> list[str]:
