@@ -29,7 +29,8 @@ WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("targ
     "distributed.worker.memory.terminate": TERMINATE_FRACTION,
     "distributed.scheduler.worker-ttl": None,
 }
-DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
+# Dask's own port, which its users know, or another where that is taken; to this machine only: it shows tasks' names.
+DASHBOARD_ADDRESS = "127.0.0.1:8787"
 
 
 class Need(NamedTuple):
@@ -194,18 +195,8 @@ def slots_of(client: Any) -> int:
     return sum(client.nthreads().values())
 
 
-def dashboard_address() -> str:
-    """Where the dashboard answers, to this machine only: it shows the tasks' names."""
-    with socket.socket() as one:
-        try:
-            one.bind(("127.0.0.1", DASHBOARD_PORT))
-        except OSError:
-            return "127.0.0.1:0"
-    return f"127.0.0.1:{DASHBOARD_PORT}"
-
-
 def dashboard_link(client: Any) -> str:
-    """The page that answers at `dashboard_address`; dask's own words have the scheduler's name in it."""
+    """The page that answers there; dask's own words have the scheduler's name in it."""
     return f"http://127.0.0.1:{client.scheduler_info()['services']['dashboard']}/status"
 
 

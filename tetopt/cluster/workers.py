@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.cluster.crew import (
+    DASHBOARD_ADDRESS,
     MEMORY_MARGIN,
     About,
     Folders,
@@ -28,7 +29,6 @@ from tetopt.cluster.crew import (
     Newcomers,
     Workers,
     counted,
-    dashboard_address,
     limiter,
     slots_of,
 )
@@ -167,7 +167,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
             security=True,
             memory_limit=limit,
             local_directory=str(own_folder),
-            dashboard_address=dashboard_address(),
+            dashboard_address=DASHBOARD_ADDRESS,
             env={THREADS_NAME: str(share.threads)} if need.is_within else None,
         )
     )
@@ -266,7 +266,9 @@ def _quiet(log: Path) -> Iterator[None]:
             before.append((logger, logger.handlers, logger.propagate))
             logger.handlers, logger.propagate = [handler], False
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Port .* is already in use")  # of the dashboard, where another run's is
+            yield
     finally:
         for logger, handlers, propagate in before:
             logger.handlers, logger.propagate = handlers, propagate
