@@ -12,7 +12,7 @@ import pytest
 
 from tetopt import InputError
 from tetopt.cohort.bids_folder import bids_subjects
-from tetopt.cohort.layout import begin, description
+from tetopt.cohort.layout import begin
 from tetopt.cohort.subjects import Problems, Subject, matching
 
 
@@ -173,7 +173,7 @@ def test_a_cohort_folder_passes_the_validator_of_bids(tmp_path):
     if validator is None:
         pytest.skip("no bids-validator-deno")
     out = tmp_path / "out"
-    begin(out, description("meshes", [tmp_path.as_uri()]))
+    begin(out, [tmp_path.as_uri()])
     for name in [
         "cohort.tsv", "cohort.html", "logs/sub-1_ses-a.log", "logs/sub-2.failed.json",
         "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.vtu", "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.json",

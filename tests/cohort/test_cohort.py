@@ -21,8 +21,7 @@ from tetopt import InputError
 from tetopt.cohort import cohort as cohort_module
 from tetopt.cohort import estimate as estimate_module
 from tetopt.cohort import plan as cohort_plan
-from tetopt.cohort.estimate import Estimate
-from tetopt.cohort.layout import begin, description, locked
+from tetopt.cohort.layout import begin, locked
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
@@ -274,7 +273,7 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
     (small / "empty.nii").touch()
     lines = ("subject\timage\tmask", "1\ta.nii.gz\t", "2\ta.nii.gz\ta.nii.gz", "3\tlink.nii\t", "4\tempty.nii\t")
     (small / "t.tsv").write_text("\n".join((*lines, "a_b\ta.nii.gz\t")) + "\n")
-    begin(small / "out", description("test", []))
+    begin(small / "out")
     (small / "out" / ".work" / "lock").touch()
     (small / "out" / "sub-ab").mkdir()
     (small / "out" / "sub-ab" / "thesis.txt").touch()
@@ -331,7 +330,7 @@ def test_a_folder_of_something_else_is_not_written_to(small, capsys):
 
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
-    begin(small / "out", description("test", []))
+    begin(small / "out")
     (small / "out" / ".work" / "lock").touch()
 
     def fail(*_):
@@ -364,7 +363,7 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
 def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
     """It does not begin here; jobs of a batch system may still have that memory."""
     monkeypatch.setattr(estimate_module, "available_bytes", lambda: 8e9)
-    estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)})
+    estimate = {"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)}
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
     assert [estimate_module.need_of(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
 
@@ -372,7 +371,7 @@ def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatc
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
     """It is written now and then: not at each subject, and again when its time has come."""
     place = tmp_path / "out"
-    begin(place, description("test", []))
+    begin(place)
     refresh = cohort_module._refresher(place)
     refresh()
     assert not (place / "cohort.html").exists()
@@ -392,7 +391,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
     keys = []
     monkeypatch.setattr(cohort_module, "locked", locked)
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
-    monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}))
+    monkeypatch.setattr(cohort_module, "estimated", lambda _: {})
     monkeypatch.setattr(cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run))
     exit_code("cohort", small / "t.tsv", "-o", small / "out")
     assert keys == ["sub-02"]

@@ -10,7 +10,7 @@ from cohorts import run_of, save_run, thumbnail
 from commands import assert_refused, exit_code
 
 from tetopt.cohort import plan as cohort_plan
-from tetopt.cohort.layout import begin, description, log_path, numbers_path, publish, restore, thumbnail_path
+from tetopt.cohort.layout import begin, log_path, numbers_path, publish, restore, thumbnail_path
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.errors import InputError
@@ -30,7 +30,7 @@ def out(tmp_path, image):
     """A cohort of one subject, meshed with other options, and its table beside."""
     (tmp_path / "t.tsv").write_text(f"subject\timage\n01\t{image}\n")
     out = tmp_path / "out"
-    begin(out, description("test", []))
+    begin(out)
     rng = np.random.default_rng(1)
     run = run_of(rng)
     run["request"]["files"] = {}

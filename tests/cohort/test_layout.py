@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from tetopt.cohort.layout import begin, check_out, description, locked, publish, restore, subject_folder
+from tetopt.cohort.layout import begin, check_out, locked, publish, restore, subject_folder
 from tetopt.errors import InputError
 
 
 @pytest.fixture
 def out(tmp_path):
-    begin(tmp_path / "out", description("test", ["/bids"]))
+    begin(tmp_path / "out", ["/bids"])
     return tmp_path / "out"
 
 

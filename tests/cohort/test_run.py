@@ -11,7 +11,7 @@ import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
-from tetopt.cohort.layout import begin, description, failure_path, log_path, numbers_path, subject_folder
+from tetopt.cohort.layout import begin, failure_path, log_path, numbers_path, subject_folder
 from tetopt.cohort.run import SubjectTask, _reason, run_subject
 
 WORDS = ("--nodes=60", "--iterations=1", "--")
@@ -27,7 +27,7 @@ def image(tmp_path_factory):
 @pytest.fixture
 def job(tmp_path, image):
     out = tmp_path / "out"
-    begin(out, description("test", []))
+    begin(out)
     (out / ".work" / "run-1").touch()
     return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, 0.0, "run-1")
 
