@@ -46,6 +46,7 @@ def test_arguments_that_are_none(arguments, capsys):
     assert capsys.readouterr().err.count("\n") >= 1
 
 
+@pytest.mark.full
 def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
     """One subject while another run has another's lock; the group waits for that, and tells of it."""
     raw, out = tmp_path / "raw", tmp_path / "out"
