@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import dask
+import psutil
 import pytest
 from commands import exit_code
 from distributed import KilledWorker, LocalCluster
@@ -49,15 +50,8 @@ def noisy():
 
 def processes():
     """Of this process: those that were started by it, and have not ended."""
-    mine = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            words = (folder / "stat").read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue
-        if int(words[1]) == os.getpid() and words[0] != "Z":
-            mine.append(b" ".join((folder / "cmdline").read_bytes().split(b"\0")))
-    return mine
+    children = psutil.Process().children()
+    return [" ".join(each.cmdline()) for each in children if each.status() != psutil.STATUS_ZOMBIE]
 
 
 # ---- How many
@@ -110,7 +104,7 @@ def test_workers_of_this_machine(folders, capfd):
         until(lambda: crew.slots() == 1)
         worker = crew.client.submit(noisy, pure=False).result()
         assert Path("/proc", str(worker)).exists()
-    assert [words for words in processes() if words not in before and b"resource_tracker" not in words] == []
+    assert [words for words in processes() if words not in before and "resource_tracker" not in words] == []
     assert not Path("/proc", str(worker)).exists()
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")

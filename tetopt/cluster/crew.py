@@ -171,28 +171,30 @@ class Newcomers:
             )
 
 
-def limiter() -> Any:
-    """A plugin by which an allocation that would take a worker over its limit of memory fails, where systems have that.
+def beginning(is_within: bool, log: Path | None = None) -> Any:
+    """A plugin that sets up workers as they begin, also those that are started again.
 
-    And by which it ends with its nanny, whatever it does just then.
-    A nanny ends its worker after the fact, when it next looks. RLIMIT_DATA counts what the process may write to and
-    has not got from a file, touched or not; files' pages, which can be had again, count for the nanny alone.
+    With `is_within` an allocation that would take a worker over its limit of memory fails, where systems have that, and
+    a worker ends with its nanny, whatever it does just then. A nanny ends its worker after the fact, when it next
+    looks. RLIMIT_DATA counts what the process may write to and has not got from a file, touched or not; files' pages,
+    which can be had again, count for the nanny alone. What a worker would write to the terminal goes to the end of
+    `log`.
     """
     from distributed import WorkerPlugin
 
-    class Limiter(WorkerPlugin):
+    class Beginning(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            end_with_parent()
-            limit = worker.memory_manager.memory_limit
-            if limit:
-                limit_self("RLIMIT_DATA", limit)
+            if log is not None:
+                descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+                os.dup2(descriptor, 1)
+                os.dup2(descriptor, 2)
+                os.close(descriptor)
+            if is_within:
+                end_with_parent()
+                if limit := worker.memory_manager.memory_limit:
+                    limit_self("RLIMIT_DATA", limit)
 
-    return Limiter()
-
-
-def slots_of(client: Any) -> int:
-    """The threads of all workers that are there: each runs one task at a time."""
-    return sum(client.nthreads().values())
+    return Beginning()
 
 
 def dashboard_link(client: Any) -> str:

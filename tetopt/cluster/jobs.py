@@ -25,9 +25,9 @@ from tetopt.cluster.crew import (
     Need,
     Newcomers,
     Workers,
+    beginning,
     counted,
     dashboard_link,
-    limiter,
 )
 from tetopt.errors import InputError
 from tetopt.system.budget import memory_words
@@ -98,8 +98,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
     cluster = stack.enter_context(cluster_of(path, kind, job, own_folder, folders.logs))
     client = stack.enter_context(Client(cluster))
-    if need.is_within:
-        client.register_plugin(limiter())
+    client.register_plugin(beginning(need.is_within))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)
     with _refused("`cluster`: the batch system takes no job"):
