@@ -43,12 +43,6 @@ def test_failures_are_on_top_with_their_logs(cohort):
     assert links == [[(key_of(k), key_of(k)) for k in ks] for ks in ((2, 42), (22, 62))]
 
 
-def test_what_all_have_in_common_is_said_once(cohort):
-    _, text = cohort
-    assert "Of all meshes: tetopt 0.1.0, nodes 8000, k_D 0.85, method fast, young 3.0, format .vtu." in text
-    assert "options.nodes" not in {column["name"] for column in data_of(text)["columns"]}
-
-
 def test_what_differs_is_said_with_how_many(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(10):
@@ -205,11 +199,3 @@ def test_without_scripts_there_is_a_table(cohort):
     assert table.count("<tr>") == 101
     assert "orientation LPS: 94 of 95 have RAS" in table
     assert table.index("LPS") < table.index(key_of(0))
-
-
-def test_a_picture_that_is_none_of_ours_stays_out(tmp_path):
-    big = np.random.default_rng(0).bytes(40_000)
-    save_run(tmp_path, "sub-1", {"violated": {}}, big)
-    save_run(tmp_path, "sub-2", {"violated": {}}, thumbnail(np.random.default_rng(0)))
-    save_cohort_files(tmp_path, collect(tmp_path))
-    assert list(data_of((tmp_path / "cohort.html").read_text(encoding="utf-8"))["pictures"]) == ["1"]

@@ -182,24 +182,16 @@ def test_foreign_files_that_come_during_a_run_do_not_keep_it_from_its_end(out):
     assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "tetopt-manifest", "thesis.txt"]
 
 
-@pytest.mark.parametrize("kind", ["file link", "pipe"])
+@pytest.mark.parametrize("kind", ["file link", "pipe", "folder link"])
 def test_a_picture_of_another_table_that_is_a_link_is_not_in_the_page(out, kind):
     """Its subject is no subject of this run's, which therefore does not refuse it."""
     (out.parent / "t.tsv").write_text("subject\timage\n02\tb.nii.gz\n")
-    elsewhere = outside(out.parent)
-    (elsewhere / "notes.txt").write_bytes(thumbnail_path(out, KEY).read_bytes())
-    planted(kind, thumbnail_path(out, KEY), elsewhere)
-    assert exit_code(*words(out, "--collect")) == 1
-    assert pictures(out) == {}
-
-
-def test_a_picture_of_another_table_in_a_folder_that_is_a_link_is_not_in_the_page(out):
-    (out.parent / "t.tsv").write_text("subject\timage\n02\tb.nii.gz\n")
     assert exit_code(*words(out, "--collect")) == 1
     assert len(pictures(out)) == 1
-    elsewhere = outside(out.parent)
-    shutil.copy(thumbnail_path(out, KEY), elsewhere)
-    planted("folder link", out / KEY / "figures", elsewhere)
+    elsewhere, picture = outside(out.parent), thumbnail_path(out, KEY)
+    for name in ("notes.txt", picture.name):
+        (elsewhere / name).write_bytes(picture.read_bytes())
+    planted(kind, picture.parent if kind == "folder link" else picture, elsewhere)
     assert exit_code(*words(out, "--collect")) == 1
     assert pictures(out) == {}
 
