@@ -6,7 +6,7 @@ from models import sample_image
 import tetopt
 from tetopt import InputError
 from tetopt.bids import cohort_words, main
-from tetopt.cohort.layout import begin, description, locked
+from tetopt.cohort.layout import begin, locked
 
 PLACES = ["/data", "/out", "participant"]
 
@@ -46,6 +46,7 @@ def test_arguments_that_are_none(arguments, capsys):
     assert capsys.readouterr().err.count("\n") >= 1
 
 
+@pytest.mark.full
 def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
     """One subject while another run has another's lock; the group waits for that, and tells of it."""
     raw, out = tmp_path / "raw", tmp_path / "out"
@@ -53,7 +54,7 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
         (raw / f"sub-{label}" / "anat").mkdir(parents=True)
         tetopt.save_image(raw / f"sub-{label}" / "anat" / f"sub-{label}_T1w.nii", sample_image(3))
     (raw / "dataset_description.json").write_text('{"Name": "x", "BIDSVersion": "1.8.0"}')
-    begin(out, description("meshes", []))
+    begin(out)
     with locked(out, ["sub-02"]):
         options = ["--nodes", "60", "--iterations", "1"]
         assert main([str(raw), str(out), "participant", "--participant_label", "02", *options]) == 2

@@ -31,14 +31,8 @@ REFUSED = [
     ("--parts 0", "--parts"),
     ("--parts 2 --uniform", "--parts: of a graded mesh"),
     ("--parts 2 --mask ball.nii.gz", "--mask: looks at all cells or voxels at once"),
-    ("--parts 2 --labels ball.nii.gz", "--labels: looks at all"),
-    ("--parts 2 --background auto", "--background: looks at all"),
-    ("--parts 2 --slice 2=9", "--slice: looks at all"),
-    ("--parts 2 --target-error 0.1", "--target-error: looks at all"),
     ("--parts 2 --edge-size 9", "--edge-size: looks at all"),
     ("--parts 2 --order 2", "--order: looks at all"),
-    ("--parts 2 --boundary fixed", "--boundary: looks at all"),
-    ("--parts 2 --max-gb 3", "--max-gb: looks at all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
     ("--parts 4", "--parts: expected up to 3 of 300 nodes, 100 each, got 4; ask for fewer"),
     ("--parts 4 --predict", "--parts: expected up to 3 of 300 nodes"),
@@ -51,8 +45,7 @@ REFUSED = [
 @pytest.mark.parametrize(("options", "match"), REFUSED, ids=[options for options, _ in REFUSED])
 def test_refused(tmp_path, inputs, monkeypatch, capfd, options, match):
     monkeypatch.chdir(inputs)
-    number = [] if "--target-error" in options else ["--nodes", "300"]
-    assert_refused(capfd, ["mesh", "ball.nii", *options.split(), "-o", tmp_path / "a.vtu", *number], match)
+    assert_refused(capfd, ["mesh", "ball.nii", *options.split(), "-o", tmp_path / "a.vtu", "--nodes", 300], match)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -62,14 +55,27 @@ def test_planes_are_refused(tmp_path, capfd):
     assert_refused(capfd, command, "--parts: of a volume, and the image is a plane; leave it out")
 
 
-def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypatch):
+OF_TWO = ["--nodes", 300, "--parts", 2, "--iterations", 3, "--workers", 1]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, inputs):
+    """A run in one go: its mesh and its numbers."""
+    folder = tmp_path_factory.mktemp("whole")
+    command = ["mesh", inputs / "ball.nii", *OF_TWO, "-o", folder / "a.vtu", "--json", folder / "a.json"]
+    assert exit_code(*command) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["a.json", "a.vtu"]
+    return load_mesh(folder / "a.vtu"), json.loads((folder / "a.json").read_text())
+
+
+@pytest.mark.full
+def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, monkeypatch):
     """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
-    command = ["mesh", inputs / "ball.nii", "--nodes", 300, "--parts", 2, "--iterations", 3]
-    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--workers", 1) == 0
     monkeypatch.setattr(in_parts, "MOST_LOADED", 0)
-    files = ["-o", tmp_path / "b.vtkhdf", "--json", tmp_path / "b.json"]
-    assert exit_code(*command, *files, "--workers", 2, "--worker-gb", 2, "--young", "2 + 0.01*h") == 0
-    one, other = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    files = ["-o", tmp_path / "b.vtkhdf", "--json", tmp_path / "b.json", "--young", "2 + 0.01*h"]
+    command = ["mesh", inputs / "ball.nii", *OF_TWO[:-1], 2, "--worker-gb", 2, *files]
+    assert exit_code(*command) == 0
+    one, other = whole[1], json.loads((tmp_path / "b.json").read_text())
     assert one["mesh_sha256"] == other["mesh_sha256"]
     for name, value in one["image_properties"].items():
         assert np.allclose(value, other["image_properties"][name], rtol=1e-12), name
@@ -85,44 +91,45 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypat
     assert not list(tmp_path.glob("*.work"))
 
 
+@pytest.mark.full
 def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypatch, capfd):
+    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300]
     monkeypatch.setattr(in_parts, "available_bytes", lambda: 1000)
     chosen = []
     monkeypatch.setattr("tetopt.job.meshing.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300)
+        exit_code(*command)
     assert "in one piece it would take" in capfd.readouterr().err
     assert chosen[0][0].plan.division.n_parts == 1  # as run.json's request has it
     # What parts do not do is tried in one piece, as ever: the bound on its memory is a rough one.
-    assert exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--order", 2) == 0
+    assert exit_code(*command, "--order", 2, "--iterations", 1) == 0
 
 
-def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
-    """One that is cut short leaves the mesh of the last complete round, and the same request goes on from there."""
-    command = ["mesh", inputs / "ball.nii.gz", "--nodes", 300, "--parts", 2, "--iterations", 6, "--workers", 1]
-    assert exit_code(*command, "-o", tmp_path / "whole.vtu") == 0
+@pytest.mark.full
+def test_a_run_out_of_time_goes_on(tmp_path, inputs, whole, monkeypatch, capfd):
+    """It leaves the mesh of the last complete round, and the same request goes on from there, no other."""
+    folder, other = tmp_path / "a.vtu.work", tmp_path / "ball.nii"
+    folder.mkdir()
+    save_volume(folder, tetopt.Image(np.full((9, 9, 9), 3.0)))  # of a run that was killed before it had a mesh
+    command = ["mesh", inputs / "ball.nii.gz", *OF_TWO]
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--max-seconds", "1e-6") == 2
     assert "a.vtu.work: ended before the first round was complete; run this again" in capfd.readouterr().err
     assert not (tmp_path / "a.vtu").exists()
-    other = tmp_path / "ball.nii.gz"
-    save_image(
-        other, tetopt.Image(load_image(inputs / "ball.nii.gz").data[::-1], load_image(inputs / "ball.nii.gz").affine)
-    )
-    changes = [
-        ("--k-d", 0.5), ("--nodes", 310), ("--parts", 3), ("--iterations", 9), ("--shape-power", 2),
-        ("--min-dihedral", 9), ("--size-min", 3), ("--edge-max", 20), ("--gradation", 0.2), ("--crop", "0:22,:,:"),
-    ]  # fmt: skip
+    image = load_image(inputs / "ball.nii.gz")
+    save_image(other, tetopt.Image(image.data[::-1], image.affine))
+    changes = [("--k-d", 0.5), ("--nodes", 310), ("--iterations", 9), ("--size-min", 3), ("--crop", "0:22,:,:")]
     for each in [[*command, *change] for change in changes] + [["mesh", other, *command[2:]]]:
         assert exit_code(*each, "-o", tmp_path / "a.vtu") == 2, each
         assert "a.vtu.work: work directory of another run" in capfd.readouterr().err
+    # A file that comes during the run stays.
+    monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
-    one, other = (load_mesh(tmp_path / name).mesh for name in ("whole.vtu", "a.vtu"))
-    assert np.array_equal(one.points, other.points)
-    assert np.array_equal(one.cells, other.cells)
-    assert not list(tmp_path.glob("*.work"))
-
-
-OF_TWO = ["--nodes", 300, "--parts", 2, "--iterations", 3, "--workers", 1]
+    assert "a.vtu.work: stays with what is not tetopt's in it: note.txt" in capfd.readouterr().err
+    assert content(folder) == {"note.txt": b"mine"}
+    loaded = load_mesh(tmp_path / "a.vtu")
+    assert np.array_equal(loaded.mesh.points, whole[0].mesh.points)
+    assert np.array_equal(loaded.mesh.cells, whole[0].mesh.cells)
+    assert np.array_equal(loaded.cell_data["max"], whole[0].cell_data["max"])
 
 
 def test_what_was_refused_leaves_nothing_and_stands_in_no_way(tmp_path, inputs, monkeypatch, capfd):
@@ -140,18 +147,7 @@ def test_what_was_refused_leaves_nothing_and_stands_in_no_way(tmp_path, inputs, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_voxels_that_a_run_without_an_octree_left_are_not_those_of_another_image(tmp_path, inputs, capfd):
-    """What a run had noted, that was killed before it had a mesh, is noted anew."""
-    folder = tmp_path / "a.vtu.work"
-    folder.mkdir()
-    save_volume(folder, tetopt.Image(np.full((9, 9, 9), 3.0)))
-    assert exit_code("mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu") == 0
-    loaded = load_mesh(tmp_path / "a.vtu")
-    direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii.gz"))
-    assert np.array_equal(loaded.cell_data["max"], direct["max"])
-    assert not folder.exists()
-
-
+@pytest.mark.deep
 @pytest.mark.parametrize("kind", [*KINDS, "a lock"])
 def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, kind):
     place, elsewhere = tmp_path / "a.vtu.work", outside(tmp_path)
@@ -166,6 +162,7 @@ def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, 
     assert content(tmp_path) == before
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(("name", "kind"), [
     ("lock", "hard link"), ("lock", "file link"), ("lock", "pipe"), ("voxels.npy", "file link"), ("voxels.npy", "pipe"),
     ("volume.json", "device link"), ("state.json", "device link"), ("state.json", "pipe"), ("round-0", "folder link"),
@@ -181,14 +178,6 @@ def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inpu
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
     assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away, and run this again")
     assert content(tmp_path) == before
-
-
-def test_a_file_that_comes_into_the_work_directory_during_the_run_stays(tmp_path, inputs, monkeypatch, capfd):
-    folder = tmp_path / "a.vtu.work"
-    monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
-    assert exit_code("mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu") == 0
-    assert "a.vtu.work: stays with what is not tetopt's in it: note.txt" in capfd.readouterr().err
-    assert content(folder) == {"note.txt": b"mine"}
 
 
 def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):

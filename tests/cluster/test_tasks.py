@@ -21,6 +21,7 @@ from tetopt.errors import InputError
 from tetopt.system.budget import PROC_FOLDER
 from tetopt.system.interpreter import python_command, python_environment
 
+pytestmark = pytest.mark.full
 LIMIT = 0.8e9  # of a worker, which has 0.24 GB with numba loaded
 
 
@@ -95,12 +96,14 @@ def deadly(folder, n_deaths, name):
     return name
 
 
+@pytest.mark.deep
 def test_what_a_killed_worker_took_with_it_is_run_again(run, tmp_path):
     done = run(partial(deadly, tmp_path, 2), list("abc"))
     assert {name: each.result for name, each in done.items()} == {"a": "a", "b": "b", "c": "c"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.0", "b.0", "b.1", "b.2", "c.0"]
 
 
+@pytest.mark.deep
 def test_what_ends_its_worker_three_times_is_said_in_a_line(run, tmp_path):
     with pytest.raises(InputError, match=r"^b: the worker that ran it ended, 3 times, as systems do") as refusal:
         run(partial(deadly, tmp_path, 9), list("abc"))
@@ -156,6 +159,7 @@ def filling(folder, name):
     time.sleep(5)
 
 
+@pytest.mark.deep
 def test_a_worker_over_its_limit_is_ended_by_its_nanny_and_the_limit_named(run, tmp_path):
     with pytest.raises(InputError, match=r"^p: takes more memory than a worker may, 0.8 GB with its own; give"):
         run(partial(filling, tmp_path), ["p"], attempts=1)
@@ -186,6 +190,7 @@ def test_once_it_is_over_nothing_begins_and_the_last_are_waited_for(run, tmp_pat
     (tmp_path / "end").touch()
 
 
+@pytest.mark.deep
 def test_a_scheduler_that_is_lost_is_said_so(tmp_path):
     folders = Folders(tmp_path, tmp_path)
     with workers(Need(1, 0.0, 1, is_within=True), folders, count=1, scheduler=None, cluster=None) as crew:

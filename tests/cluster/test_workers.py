@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import dask
+import psutil
 import pytest
 from commands import exit_code
 from distributed import KilledWorker, LocalCluster
@@ -49,15 +50,8 @@ def noisy():
 
 def processes():
     """Of this process: those that were started by it, and have not ended."""
-    mine = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            words = (folder / "stat").read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue
-        if int(words[1]) == os.getpid() and words[0] != "Z":
-            mine.append(b" ".join((folder / "cmdline").read_bytes().split(b"\0")))
-    return mine
+    children = psutil.Process().children()
+    return [" ".join(each.cmdline()) for each in children if each.status() != psutil.STATUS_ZOMBIE]
 
 
 # ---- How many
@@ -71,7 +65,6 @@ def processes():
         (Need(3, 2 * GB, None), None, 8, 100 * GB, (3, 2)),  # tasks
         (Need(100, 2 * GB, None), 2, 8, 100 * GB, (2, 4)),  # count
         (Need(100, 2 * GB, 4), None, 8, 100 * GB, (2, 4)),  # threads of each
-        (Need(100, 2 * GB, 16), None, 8, 100 * GB, (1, 16)),
         (Need(100, 20 * GB, None), 5, 2, 11 * GB, (1, 2)),  # none fits: one, which its own check refuses
     ],
 )
@@ -91,6 +84,7 @@ def test_threads_of_a_subject_are_those_of_the_busiest_host():
 # ---- Here
 
 
+@pytest.mark.full
 def test_workers_of_this_machine(folders, capfd):
     """A dead one costs its own task at once; nothing of them is on the terminal, nor left afterwards."""
     before = processes()
@@ -110,7 +104,7 @@ def test_workers_of_this_machine(folders, capfd):
         until(lambda: crew.slots() == 1)
         worker = crew.client.submit(noisy, pure=False).result()
         assert Path("/proc", str(worker)).exists()
-    assert [words for words in processes() if words not in before and b"resource_tracker" not in words] == []
+    assert [words for words in processes() if words not in before and "resource_tracker" not in words] == []
     assert not Path("/proc", str(worker)).exists()
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")
@@ -143,12 +137,7 @@ def test_workers_of_a_scheduler_that_runs(others, folders):
     assert len(others.scheduler.workers) == 2  # they go on
 
 
-def test_workers_with_too_little_memory_are_refused(others, folders):
-    with pytest.raises(InputError, match=r"has 4 GB for each of 2 tasks, the largest needs about 5 GB; .*--nthreads 1"):
-        running(Need(10, 5 * GB, None), folders, scheduler=others.scheduler.address).__enter__()
-
-
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "host", ""])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", ""])
 def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, folders, monkeypatch, capfd):
     monkeypatch.setattr("tetopt.cluster.workers.CONNECT_SECONDS", 0.2)
     with pytest.raises(InputError, match="does not answer") as refusal:
@@ -164,19 +153,18 @@ def silent():
         yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
 
-@pytest.mark.parametrize("command", ["cohort t.tsv -o out", "mesh large.nii -o out --parts 2"])
-def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(command, silent, tmp_path, monkeypatch, capfd):
+@pytest.mark.full
+def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(silent, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("tetopt.cluster.workers.CONNECT_SECONDS", 0.3)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
     save_image(tmp_path / "large.nii", sample_image(3))
     os.truncate(tmp_path / "large.nii", 400)  # a header alone
-    assert exit_code(*command.replace("-o out", "-o out.vtu").split(), "--nodes", 200, "--scheduler", silent) == 2
-    said = capfd.readouterr()
-    assert said.out == ""
-    assert said.err.count("\n") == 1
-    assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
-    assert not (tmp_path / "out.vtu").exists()
+    (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
+    for command in (["cohort", tmp_path / "t.tsv"], ["mesh", tmp_path / "large.nii", "--parts", 2]):
+        assert exit_code(*command, "-o", tmp_path / "out.vtu", "--nodes", 200, "--scheduler", silent) == 2
+        said = capfd.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)
+        assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
+        assert not (tmp_path / "out.vtu").exists()
 
 
 def test_another_service_at_the_address_is_no_scheduler(folders, capfd):
@@ -198,19 +186,10 @@ def test_another_service_at_the_address_is_no_scheduler(folders, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_contradictions_are_refused(folders, tmp_path):
-    with pytest.raises(InputError, match="`scheduler`, `cluster`: expected one of them"):
-        running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", cluster=tmp_path).__enter__()
-    with pytest.raises(InputError, match="`workers`: expected none with `scheduler`"):
-        running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", count=2).__enter__()
-
-
-@pytest.mark.parametrize("is_within", [True, False])
-def test_a_missing_package_is_said_with_what_installs_it(is_within, folders, monkeypatch):
+def test_a_missing_package_is_said_with_what_installs_it(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
-    words = r'dask_jobqueue is not installed, .*; pip install "distributed.*" "dask-jobqueue.*" "bokeh.*"'
-    with pytest.raises(InputError, match=words):
-        running(Need(1, 0.0, None, is_within), folders).__enter__()
+    with pytest.raises(InputError, match=r'dask_jobqueue is not installed, .*; pip install .*"dask-jobqueue.*"'):
+        running(Need(1, 0.0, None), folders).__enter__()
 
 
 def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
@@ -219,6 +198,8 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 60]
     assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
     assert "expected one of htcondor" in capsys.readouterr().err
+    assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--cluster", tmp_path) == 2
+    assert "--scheduler, --cluster: expected one of them" in capsys.readouterr().err
     assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
     assert "--workers: expected none with --scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -230,8 +211,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
         ({"version": "0.0.1"}, r"expected tetopt .* as here, got 0.0.1"),
         ({"python": "3.9"}, r"expected Python .* as here, got 3.9"),
         ({"probe": None}, "does not see .*; expected an output folder on a file system that all workers share"),
-        ({"probe": "another folder's"}, "does not see"),
-        ({"n_threads": 4, "n_bytes": 4 * GB}, "has 1 GB for each of 4 tasks, the largest needs about 3 GB"),
+        ({"n_threads": 4, "n_bytes": 4 * GB}, r"has 1 GB for each of 4 tasks, .* needs about 3 GB; .*--nthreads 1"),
     ],
 )
 def test_a_worker_is_looked_at_when_it_comes(change, words, tmp_path):
@@ -279,39 +259,38 @@ def written(folder, text):
     return path
 
 
+# A list of 10^9 entries in a line.
+ROWS = [f"&a{n + 1} [{', '.join([f'*a{n}'] * 10)}]" for n in range(9)]
+ALIASES = f"[&a0 [x], {', '.join(ROWS)}]"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "expected one batch system"),
-        ("[1, 2]", "expected one batch system"),
-        ("slurm: {queue: long}", "expected one batch system"),
         ("jobqueue: {slurm: {}, pbs: {}}", "expected one batch system"),
         ("jobqueue: {slurm: {}}\ndistributed: {}", "expected one batch system"),
         ("jobqueue: {slum: {}}", "expected one of htcondor, lsf, moab, oar, pbs, sge, slurm, got slum"),
         ("jobqueue: {slurm: [1]}", "slurm: expected keys with their values"),
         ("jobqueue: {slurm: {qeue: long}}", "expected keys of account, .*, walltime.*, got qeue"),
-        ("jobqueue: {slurm: {1: long}}", "got 1"),
-        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected it in quotes, as "12:00:00".*got 43200'),
-        ("jobqueue: {slurm: {cores: two}}", "cores: expected a whole number above 0, got two"),
-        ("jobqueue: {slurm: {cores: 0}}", "cores: expected a whole number above 0"),
-        ("jobqueue: {slurm: {processes: true}}", "processes: expected a whole number above 0"),
-        ("jobqueue: {slurm: {memory: lots}}", 'memory: expected memory, as "8 GB", got lots'),
         (
-            "jobqueue: {slurm: {job-script-prologue: module load python}}",
-            "job-script-prologue: expected a list of texts",
-        ),
+            "jobqueue: {slurm: {env-extra: [a]}}",
+            "expected keys of account, .*, got env-extra",
+        ),  # jobs would not have it
+        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected a text in quotes, as "12:00:00" .*got 43200'),
+        ("jobqueue: {slurm: {cores: two}}", "expected whole numbers of cores .*'two'"),
+        ("jobqueue: {slurm: {processes: 0}}", "expected whole numbers of cores .*got: processes 0"),
+        ("jobqueue: {slurm: {memory: lots}}", "memory as '8 GB', .*'lots'"),
+        ("jobqueue: {slurm: {job-script-prologue: module load x}}", "job-script-prologue: expected a list of texts"),
         ("jobqueue: {slurm: {scheduler_options: 3}}", "scheduler-options: expected keys with their values"),
         ("jobqueue: {slurm: {queue: [long]}}", "queue: expected one value"),
-        ("jobqueue: {slurm: {queue: &a long, account: *a}}", "without aliases"),
+        (f"jobqueue: {{slurm: {ALIASES}}}", "keys with their values, got .{1,250}$"),
         (
             "jobqueue: {slurm: !!python/object/apply:os.system ['touch owned']}",
             "expected YAML, got could not determine",
         ),
         ("jobqueue: {slurm: ", "expected YAML, got"),
         ("[" * 400, "expected YAML"),
-        ("- " * 4000, "expected YAML"),
-        ("[" * 600, "at most 500 brackets"),
-        ("#" * 30_000, "at most 20000 letters"),
     ],
 )
 def test_a_file_that_is_no_configuration_is_refused(text, words, tmp_path):
@@ -422,29 +401,43 @@ def batch(tmp_path, monkeypatch):
     return put
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("echo no such partition >&2; exit 1", "the batch system takes no job: no such partition"),
-        (
-            "sh $1 >/dev/null 2>&1; echo Submitted batch job 7",
-            "jobs ended as they began; their logs in",
-        ),
-    ],
-)
-def test_a_cluster_without_hope_is_given_up(command, words, batch, folders, tmp_path, capfd):
-    batch("sbatch", command)
-    batch("scancel", "exit 0")
-    path = written(tmp_path, "jobqueue: {slurm: {python: /bin/false}}")
-    with running(Need(9, 1.0, None), folders, count=2, cluster=path) as crew:
-        assert crew.words.startswith("up to 2 jobs of slurm, each of 4 cores and ")
-        with pytest.raises(InputError, match=words):
-            until(lambda: crew.slots() > 0)
+def test_a_cluster_that_takes_no_job_is_refused(batch, folders, tmp_path, capfd):
+    batch("sbatch", "echo no such partition >&2; exit 1")
+    path = written(tmp_path, "jobqueue: {slurm: {}}")
+    with pytest.raises(InputError, match=r"the batch system takes no job: no such partition$"):
+        running(Need(9, 1.0, None), folders, count=2, cluster=path).__enter__()
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_cluster_all_of_whose_jobs_end_as_they_begin_is_given_up(count, batch, folders, tmp_path, capfd):
+    batch("sbatch", f"sh $1 >/dev/null 2>&1; echo >> {tmp_path}/submitted; echo Submitted batch job 7")
+    batch("scancel", "exit 0")
+    path = written(tmp_path, "jobqueue: {slurm: {python: /bin/false}}")
+    with running(Need(9, 1.0, None), folders, count=count, cluster=path) as crew:
+        assert crew.words.startswith(f"up to {count} job")
+        with pytest.raises(InputError, match="jobs ended as they began; their logs in"):
+            until(lambda: crew.slots() > 0)
+    assert 3 <= len((tmp_path / "submitted").read_text()) < 20
+    assert list(folders.work.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_job_that_is_refused_beside_others_is_submitted_again_later(batch, folders, tmp_path, monkeypatch):
+    """As where a user may have so many; the first one runs meanwhile."""
+    submitted = tmp_path / "submitted"
+    batch("sbatch", f"echo >> {submitted}; [ $(wc -l < {submitted}) = 1 ] || exit 1; echo Submitted batch job 7")
+    batch("scancel", "exit 0")
+    with running(Need(9, 1.0, None), folders, count=2, cluster=written(tmp_path, "jobqueue: {slurm: {}}")) as crew:
+        until(lambda: crew.slots() == 0 and len(submitted.read_text()) == 2)
+        time.sleep(0.5)  # some looks at the jobs
+        assert len(submitted.read_text()) == 2
+        monkeypatch.setattr(jobs, "AGAIN_SECONDS", 0.0)
+        until(lambda: len(submitted.read_text()) > 2)
+
+
+@pytest.mark.deep
 def test_jobs_are_replaced_and_given_back(batch, folders, tmp_path, monkeypatch):
     """A batch system of two scripts. A job that is killed has a successor; one that nothing is left for goes."""
     mine = tmp_path / "jobs"
@@ -496,10 +489,10 @@ def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
         running(Need(9, 1.0, None), spaced, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.parametrize(
     ("is_within", "task"),
-    [(False, "time.sleep"), (True, "time.sleep"), (True, "ctypes.PyDLL(None).sleep")],  # the last as kernels are
+    [(False, "time.sleep"), (True, "ctypes.PyDLL(None).sleep")],  # the second as kernels are
 )
 def test_nothing_is_left_of_a_client_that_is_killed(is_within, task, tmp_path):
     program = (

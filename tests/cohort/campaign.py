@@ -5,6 +5,7 @@ should be. The last numbers are in docs/measured/cohorts.md. Failures are put in
 of them.
 """
 
+import contextlib
 import csv
 import gzip
 import json
@@ -20,15 +21,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 import tetopt
 
 COMMON = ("--iterations", "1", "--nodes", "60", "--threads", "1")
 N_KILLS = 3  # of the client, in the first half
 LEAVE_SECONDS = 60.0  # until a killed client's workers and runs have gone
-LOW_LOAD = 0.6  # processes that run on average: more, and the speed of two workers is that of the others, too
-MOST_FRACTION = 0.6  # of one worker's time that two may take
-N_TIMED = 40
 FILE_BYTES = 3000  # of the largest file where a disk is full: less than a mesh, more than a log
 KINDS = ("plain", "mask", "labels", "two contrasts")
 # Each failure: of how many of 200 subjects, what the row says, whether a rerun mends it, nothing being put in any more.
@@ -100,14 +99,12 @@ def made(folder, n_subjects, rng, failures):
 
 def processes_of(out):
     """The processes that have to do with a folder of outputs, by number: their words."""
-    mark, processes = os.fsencode(out), {}
-    for each in Path("/proc").glob("[0-9]*"):
-        try:
-            words = (each / "cmdline").read_bytes()
-            if int(each.name) != os.getpid() and (mark in words or mark in (each / "environ").read_bytes()):
-                processes[int(each.name)] = words.split(b"\0")
-        except OSError:  # it has ended meanwhile
-            continue
+    processes = {}
+    for each in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):  # it has ended meanwhile
+            words = each.cmdline()
+            if each.pid != os.getpid() and any(str(out) in text for text in (*words, *each.environ().values())):
+                processes[each.pid] = words
     return processes
 
 
@@ -122,13 +119,13 @@ class Saboteur(threading.Thread):
     def run(self):
         while not self.is_over:
             for number, words in processes_of(self.out).items():
-                if b"mesh" in words and number not in self.seen:
+                if "mesh" in words and number not in self.seen:
                     self.seen[number] = key = self.key_of(words)
                     self.harm(number, key)
             time.sleep(0.05)
 
     def key_of(self, words):
-        return Path(os.fsdecode(words[words.index(b"-o") + 1])).name.partition("_desc")[0] if b"-o" in words else ""
+        return Path(words[words.index("-o") + 1]).name.partition("_desc")[0] if "-o" in words else ""
 
     def harm(self, number, key):
         failure = self.failures.get(key)
@@ -232,25 +229,19 @@ def killed_on_the_way(folder, out, dice, n_subjects):
     return there, wrong
 
 
-def timed(folder, name, n_subjects, *options):
-    """Seconds of a run of the first subjects without failures."""
-    labels = [word for k in range(0, min(n_subjects, 4 * N_TIMED), 4) for word in ("--participant-label", f"{k:03d}")]
-    begin = time.monotonic()
-    assert begun(folder, folder / name, *labels, *options).wait() == 0, (folder / "words.txt").read_text()[-2000:]
-    return time.monotonic() - begin
-
-
 def campaign(folder, n_subjects, seed):
     """Rows of what was tried: words, result, whether it is as it should be."""
     dice, rng, out = random.Random(seed), np.random.default_rng(seed), folder / "out"
     kinds = [name for name, (count, _, _) in FAILURES.items() for _ in range(max(1, count * n_subjects // 200))]
-    # Subjects whose number is a multiple of 4 are left alone: those are timed.
-    numbers = dice.sample([k for k in range(n_subjects) if k % 4], len(kinds))
+    numbers = dice.sample(range(n_subjects), len(kinds))
     failures = {f"sub-{k:03d}": kind for k, kind in zip(numbers, kinds, strict=True)}
     made(folder, n_subjects, rng, failures)
-    expected = {key: FAILURES[failures[key]][1] if key in failures else ("done", "") for key in whole_keys(n_subjects)}
+    expected = {
+        key: FAILURES[failures[key]][1] if key in failures else ("done", "")
+        for key in map("sub-{:03d}".format, range(n_subjects))
+    }
 
-    begin, load = time.monotonic(), os.getloadavg()[0]
+    begin = time.monotonic()
     saboteur = Saboteur(out, failures)
     saboteur.start()
     there, wrong = killed_on_the_way(folder, out, dice, n_subjects)
@@ -265,11 +256,7 @@ def campaign(folder, n_subjects, seed):
               if kind.startswith(("killed", "disk")) and not saboteur.counts[key]]  # fmt: skip
     counts = [row["status"] for row in rows_of(out).values()]
     words = ", ".join(f"{counts.count(name)} {name}" for name in sorted(set(counts)))
-    yield (
-        f"{len(failures)} failures in {n_subjects}",
-        f"{words}; {time.monotonic() - begin:.0f} s, load {load:.1f}",
-        wrong,
-    )
+    yield f"{len(failures)} failures in {n_subjects}", f"{words}; {time.monotonic() - begin:.0f} s", wrong
 
     code, before = begun(folder, out).wait(), now
     now = whole(out)
@@ -284,18 +271,8 @@ def campaign(folder, n_subjects, seed):
     wrong = [f"{key}: other bytes" for key in some if not same_bytes(folder, out, key)]
     yield "bytes beside `tetopt mesh`", f"{5 - len(wrong)} of 5 alike", wrong
 
-    load = os.getloadavg()[0]
-    one, two = timed(folder, "one", n_subjects, "--workers", "1"), timed(folder, "two", n_subjects, "--workers", "2")
-    is_idle = load < LOW_LOAD
-    note = f"load {load:.1f} before" + ("" if is_idle else f", over {LOW_LOAD}: not judged")
-    too_slow = [f"{two / one:.2f} of the time"] if is_idle and two > MOST_FRACTION * one else []
-    yield f"{N_TIMED} subjects, 1 and 2 workers", f"{one:.0f} s and {two:.0f} s, {two / one:.2f}; {note}", too_slow
     rest = processes_of(folder)
     yield "processes left", str(len(rest)), [str(each) for each in rest.values()]
-
-
-def whole_keys(n_subjects):
-    return [f"sub-{k:03d}" for k in range(n_subjects)]
 
 
 def main(n_subjects, seed):

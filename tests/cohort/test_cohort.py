@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
-from cohorts import save_run
+from cohorts import save_failure, save_run
 from commands import exit_code
 
 import tetopt
@@ -21,39 +22,108 @@ from tetopt import InputError
 from tetopt.cohort import cohort as cohort_module
 from tetopt.cohort import estimate as estimate_module
 from tetopt.cohort import plan as cohort_plan
-from tetopt.cohort.estimate import Estimate
-from tetopt.cohort.layout import begin, description, locked
+from tetopt.cohort.layout import begin, locked
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
 from tetopt.job.options import RunOptions
 
-COMMON = ("--iterations", "1", "--nodes", "60")
-N_SUBJECTS = 12
-BAD = {"03": "truncated image", "05": "mask beside the image", "07": "labels beside the image"}
 WAIT_SECONDS = 240  # a machine with much else to do still gets there
-
-
-def command(folder, *options):
-    return [sys.executable, "-m", "tetopt", "cohort", str(folder / "t.tsv"), "-o", str(folder / "out"), *options]
-
-
-def begun(folder, *options):
-    """A run that has begun, its words in a file."""
-    with open(folder / "words.txt", "w") as stream:
-        return subprocess.Popen(command(folder, *options), stdout=stream, stderr=stream, cwd=folder)
-
-
-def ended(run, folder):
-    """Its exit code and words."""
-    code = run.wait(WAIT_SECONDS)
-    return code, (folder / "words.txt").read_text()
 
 
 def meshes(folder):
     """The subjects' meshes that are there, with when they were written."""
     return {path.parent.name: path.stat().st_mtime_ns for path in sorted((folder / "out").glob("sub-*/*.vtu"))}
+
+
+def table_rows(folder):
+    with open(folder / "out" / "cohort.tsv", newline="") as stream:
+        return {row["participant_id"]: row for row in csv.DictReader(stream, delimiter="\t")}
+
+
+def write_rows(folder, *rows):
+    (folder / "t.tsv").write_text("\n".join(["subject\timage\tlabels\tnodes", *map("\t".join, rows), ""]))
+
+
+@pytest.fixture
+def small(tmp_path):
+    assert exit_code("phantom", "sphere", "-o", tmp_path / "a.nii.gz", "--voxel-mm", "6") == 0
+    (tmp_path / "t.tsv").write_text("subject\timage\tnodes\n01\ta.nii.gz\t60\n02\ta.nii.gz\tn/a\n")
+    return tmp_path
+
+
+def test_a_cohort_from_python_is_that_of_the_command(small):
+    """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
+    one = {"participants": ["01"], "iterations": 1}
+    assert tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, workers=1, **one) == {
+        "sub-01": "done"
+    }
+    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", "1", "--participant-label", "01"]
+    there = meshes(small)
+    assert exit_code(*command) == 0
+    assert meshes(small) == there
+    events = []
+    tetopt.run_cohort(small / "t.tsv", str(small / "out"), on=events.append, **one, dry_run=True)
+    assert events[-1] == ("note", "1 subject: 1 done; 0 to run", None)
+    with pytest.raises(InputError, match="has no option 'noodes'; is nodes meant"):
+        tetopt.run_cohort(small / "t.tsv", small / "out", noodes=3)
+    with pytest.raises(InputError, match=r"^`nodes`: expected a whole number, got 'many'"):
+        tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")
+
+
+@pytest.mark.full
+def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_failed(small, capfd):
+    """Labels on another grid are taken to the image's."""
+    image = tetopt.load_image(small / "a.nii.gz")
+    far = np.array(image.affine)
+    far[:3, 3] += 500.0
+    tetopt.save_image(small / "far.nii.gz", tetopt.Image(1.0 * (image.data > 50), far))
+    coarse = tetopt.Image(1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0]))
+    tetopt.save_image(small / "coarse.nii.gz", coarse)
+    (small / "cut.nii.gz").write_bytes((small / "a.nii.gz").read_bytes()[:300])
+    command = ["cohort", small / "t.tsv", "-o", small / "out", "--workers", 1, "--iterations", 1, "--nodes", 60]
+    labelled, far = ["01", "a.nii.gz", "coarse.nii.gz", "n/a"], ["03", "a.nii.gz", "far.nii.gz", "n/a"]
+    write_rows(small, labelled, ["02", "cut.nii.gz", "n/a", "n/a"], far)
+    assert exit_code(*command) == 1
+    rows, page = table_rows(small), (small / "out" / "cohort.html").read_text()
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "sub-01": "done", "sub-02": "failed", "sub-03": "failed"
+    }  # fmt: skip
+    assert "taken to the image's voxels" in (small / "out" / "logs" / "sub-01.log").read_text()
+    for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
+        reason = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())["reason"]
+        assert file in rows[name]["reason"] == reason in (small / "out" / "logs" / f"{name}.log").read_text()
+        assert name in page
+    assert list(meshes(small)) == ["sub-01"]
+    # One has other options by now, one a whole image.
+    write_rows(small, [*labelled[:3], "80"], ["02", "a.nii.gz", "n/a", "n/a"], far)
+    capfd.readouterr()
+    assert exit_code(*command, "--dry-run") == 0
+    assert "1 changed: nodes was 60, is 80" in capfd.readouterr().err
+    assert exit_code(*command, "--dry-run", "--retry-failed") == 0
+    said = capfd.readouterr()
+    assert "1 subjects stay as they are" in said.err
+    assert "sub-02: " in said.out
+    assert "sub-01: " not in said.out
+
+
+def test_a_failure_is_forgotten_where_the_mesh_is_what_is_asked_for(small, monkeypatch, capfd):
+    """Options that fail, and then those again of the mesh that is there: it is done, though nothing is run."""
+    monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
+    begin(small / "out")
+    save_run(small / "out", "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}})
+    save_failure(small / "out", "sub-01", "too few nodes")
+    assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--participant-label", "01") == 0
+    assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
+    assert table_rows(small)["sub-01"]["status"] == "done"
+
+
+def begun(folder):
+    """A run that has begun, its words in a file."""
+    command = [sys.executable, "-m", "tetopt", "cohort", folder / "t.tsv", "-o", folder / "out", "--iterations", "1"]
+    with open(folder / "words.txt", "w") as stream:
+        return subprocess.Popen([*command, "--nodes", "60"], stdout=stream, stderr=stream, cwd=folder)
 
 
 def wait_for(folder, number, run):
@@ -65,148 +135,31 @@ def wait_for(folder, number, run):
         time.sleep(0.05)
 
 
-def table_rows(folder):
-    with open(folder / "out" / "cohort.tsv", newline="") as stream:
-        return {row["participant_id"]: row for row in csv.DictReader(stream, delimiter="\t")}
-
-
-def write_rows(folder, changes=None):
-    """The table: subjects 01 to 12, of which three are bad, one has labels on another grid, one nodes of its own."""
-    own = {"03": {"image": "cut.nii.gz"}, "05": {"mask": "far.nii.gz"}, "07": {"labels": "far.nii.gz"},
-           "08": {"labels": "coarse.nii.gz"}, "09": {"nodes": "80"}} | (changes or {})  # fmt: skip
-    columns = ("subject", "image", "mask", "labels", "nodes")
-    lines = ["\t".join(columns)]
-    for number in range(1, N_SUBJECTS + 1):
-        name = f"{number:02d}"
-        row = {"subject": name, "image": f"a{number % 3}.nii.gz"} | own.get(name, {})
-        lines.append("\t".join(row.get(column, "n/a") for column in columns))
-    (folder / "t.tsv").write_text("\n".join(lines) + "\n")
-
-
-@pytest.fixture(scope="module")
-def cohort(tmp_path_factory):
-    """A folder with a table of twelve subjects, run three times: ended by Ctrl-C, a worker killed, with changes."""
-    folder = tmp_path_factory.mktemp("cohort")
-    for number in range(3):
-        words = ["phantom", "sphere", "-o", folder / f"a{number}.nii.gz", "--voxel-mm", str(5 + 0.5 * number)]
-        assert exit_code(*words) == 0
-    whole = (folder / "a0.nii.gz").read_bytes()
-    (folder / "cut.nii.gz").write_bytes(whole[: len(whole) // 2])
-    image = tetopt.load_image(folder / "a0.nii.gz")
-    far = np.array(image.affine)
-    far[:3, 3] += 500.0
-    tetopt.save_image(folder / "far.nii.gz", tetopt.Image(1.0 * (image.data > 50), far))
-    coarse = tetopt.Image(1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0]))
-    tetopt.save_image(folder / "coarse.nii.gz", coarse)
-    write_rows(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def interrupted(cohort):
-    """Ended by Ctrl-C after two subjects: exit code, words, the meshes there were."""
-    run = begun(cohort, *COMMON)
-    wait_for(cohort, 2, run)
-    run.send_signal(signal.SIGINT)
-    code, words = ended(run, cohort)
-    return code, words, meshes(cohort)
-
-
-@pytest.fixture(scope="module")
-def resumed(cohort, interrupted):
-    """The same command again, of which a worker is killed on the way: exit code, words, the meshes there are."""
-    run = begun(cohort, *COMMON)
-    wait_for(cohort, len(interrupted[2]) + 1, run)
-    victims = workers_of(run.pid)
-    os.kill(victims[0], signal.SIGKILL)
-    code, words = ended(run, cohort)
-    return code, words, meshes(cohort)
-
-
 def workers_of(pid):
     """The worker processes of a run: those that have a run of `tetopt mesh` for a child, or could have."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-    children = [child for child, parent in parents.items() if parent == pid]
-    return [each for each in children if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
+    return [child.pid for child in psutil.Process(pid).children() if "spawn_main" in " ".join(child.cmdline())]
 
 
-def test_ctrl_c_keeps_what_is_done(cohort, interrupted):
-    code, words, there = interrupted
-    assert code == 130
-    assert 2 <= len(there) < N_SUBJECTS - len(BAD)
+@pytest.mark.deep
+def test_ctrl_c_keeps_what_is_done_and_a_rerun_does_the_rest_though_a_worker_dies(small):
+    write_rows(small, *([f"0{number}", "a.nii.gz", "n/a", "n/a"] for number in range(1, 6)))
+    run = begun(small)
+    wait_for(small, 1, run)
+    run.send_signal(signal.SIGINT)
+    assert run.wait(WAIT_SECONDS) == 130
+    words, first = (small / "words.txt").read_text(), meshes(small)
+    assert 1 <= len(first) < 5
     assert "to go on" in words
     assert "Traceback" not in words
-    assert {path.name for path in (cohort / "out" / ".work").iterdir()} == {"lock", "tetopt-manifest"}
-
-
-def test_a_rerun_does_the_rest_though_a_worker_dies(cohort, interrupted, resumed):
-    code, words, there = resumed
-    assert code == 1, words
-    assert sorted(there) == [f"sub-{n:02d}" for n in range(1, N_SUBJECTS + 1) if f"{n:02d}" not in BAD]
-    for name, when in interrupted[2].items():
-        assert there[name] == when, f"{name} was made again"
-    assert f"{N_SUBJECTS} subjects: {len(interrupted[2])} done" in words
-
-
-def test_what_failed_is_a_row_with_its_reason(cohort, resumed):
-    reasons = {
-        name: json.loads((cohort / "out" / "logs" / f"sub-{name}.failed.json").read_text())["reason"] for name in BAD
-    }
-    assert "cut.nii.gz" in reasons["03"]
-    assert "far.nii.gz" in reasons["05"]
-    assert "far.nii.gz" in reasons["07"]
-    rows = table_rows(cohort)
-    assert len(rows) == N_SUBJECTS
-    for name, reason in reasons.items():
-        assert (rows[f"sub-{name}"]["status"], rows[f"sub-{name}"]["reason"]) == ("failed", reason)
-        assert reason in (cohort / "out" / "logs" / f"sub-{name}.log").read_text()
-    page = (cohort / "out" / "cohort.html").read_text()
-    assert all(f"sub-{name}" in page for name in BAD)
-
-
-def test_labels_on_another_grid_are_taken_to_the_images(cohort, resumed):
-    assert "taken to the image's voxels" in (cohort / "out" / "logs" / "sub-08.log").read_text()
-    assert table_rows(cohort)["sub-08"]["status"] == "done"
-
-
-def test_a_rerun_makes_what_changed_and_what_failed(cohort, resumed):
-    """Subject 09 has other options and 03 a whole image by now; 05 and 07 fail again; no other is touched."""
-    write_rows(cohort, {"03": {"image": "a0.nii.gz"}, "09": {"nodes": "90"}})
-    code, words = ended(begun(cohort, *COMMON), cohort)
-    assert code == 1
-    assert "1 changed: nodes was 80, is 90" in words
-    now = meshes(cohort)
-    assert {name for name, when in now.items() if resumed[2].get(name) != when} == {"sub-03", "sub-09"}
-    assert not (cohort / "out" / "logs" / "sub-03.failed.json").exists()
-
-
-def test_nothing_is_run_twice_and_failed_ones_alone_on_request(cohort, resumed):
-    write_rows(cohort, {"03": {"image": "a0.nii.gz"}, "09": {"nodes": "100"}, "05": {}, "07": {}})
-    before = meshes(cohort)
-    code, words = ended(begun(cohort, *COMMON, "--retry-failed"), cohort)
-    assert code == 0, words
-    assert {name for name, when in meshes(cohort).items() if before.get(name) != when} <= {"sub-03", "sub-05", "sub-07"}
-    assert "subjects stay as they are" in words
-    code, words = ended(begun(cohort, *COMMON, "--participant-label", "01"), cohort)
-    assert code == 0
-    assert "1 subject: 1 done; 0 to run" in words
-
-
-def test_a_failure_is_forgotten_where_the_mesh_is_what_is_asked_for(cohort, resumed):
-    """Options that fail, and then those again of the mesh that is there: it is done, though nothing is run."""
-    write_rows(cohort, {"01": {"nodes": "6"}})
-    one = (*COMMON, "--participant-label", "01")
-    code, words = ended(begun(cohort, *one), cohort)
-    assert code == 1, words
-    write_rows(cohort)
-    code, words = ended(begun(cohort, *one), cohort)
-    assert code == 0, words
-    assert "1 subject: 1 done; 0 to run" in words
+    assert {path.name for path in (small / "out" / ".work").iterdir()} == {"lock", "tetopt-manifest"}
+    run = begun(small)
+    wait_for(small, len(first) + 1, run)
+    os.kill(workers_of(run.pid)[0], signal.SIGKILL)
+    assert run.wait(WAIT_SECONDS) == 0, (small / "words.txt").read_text()
+    second = meshes(small)
+    assert sorted(second) == [f"sub-0{number}" for number in range(1, 6)]
+    assert {name: second[name] for name in first} == first  # none is made again
+    assert f"5 subjects: {len(first)} done" in (small / "words.txt").read_text()
 
 
 def refused(folder, capsys, *options):
@@ -215,13 +168,6 @@ def refused(folder, capsys, *options):
     assert exit_code("cohort", folder / "t.tsv", "-o", folder / "out", *options) == 2
     assert sorted(folder.rglob("*")) == before
     return [line for line in capsys.readouterr().err.splitlines() if line.startswith("tetopt: ")]
-
-
-@pytest.fixture
-def small(tmp_path):
-    assert exit_code("phantom", "sphere", "-o", tmp_path / "a.nii.gz", "--voxel-mm", "6") == 0
-    (tmp_path / "t.tsv").write_text("subject\timage\tnodes\n01\ta.nii.gz\t60\n02\ta.nii.gz\tn/a\n")
-    return tmp_path
 
 
 def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
@@ -238,7 +184,7 @@ def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    (("--nodes", "-1"), "nodes"), (("--threads", "0"), "--threads: expected 1 or more"),
+    (("--threads", "0"), "--threads: expected 1 or more"),
     (("--format", "docx"), "--format: expected one of"),
     (("--mask", "m-{subject}.nii"), "m-01.nii is not there"), (("--participant-label", "9"), "has no subject 9"),
     (("--mask", "a.nii.gz", "--background", "3"), "give one of them"),
@@ -257,13 +203,10 @@ def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
     assert entry.words() == ("--nodes=60", f"--young={small / 'mapping.csv'}", "--", str(small / "a.nii.gz"))
 
 
-def test_threads_are_of_all_subjects(small, capsys):
-    """They are a part of the machine; those of one subject would be passed over."""
+def test_threads_are_of_all_subjects_and_a_volume_of_the_first_image_is_an_option(small, capsys):
+    """Threads are a part of the machine; those of one subject would be passed over."""
     (small / "t.tsv").write_text("subject\timage\tthreads\n01\ta.nii.gz\t1\n")
     assert "leave the column out" in refused(small, capsys)[0]
-
-
-def test_a_volume_of_the_first_image_is_an_option(small, capsys):
     (small / "t.tsv").write_text("subject\timage\timage_2\n01\ta.nii.gz:0\ta.nii.gz:0\n")
     assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 is not there"]
 
@@ -274,7 +217,7 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
     (small / "empty.nii").touch()
     lines = ("subject\timage\tmask", "1\ta.nii.gz\t", "2\ta.nii.gz\ta.nii.gz", "3\tlink.nii\t", "4\tempty.nii\t")
     (small / "t.tsv").write_text("\n".join((*lines, "a_b\ta.nii.gz\t")) + "\n")
-    begin(small / "out", description("test", []))
+    begin(small / "out")
     (small / "out" / ".work" / "lock").touch()
     (small / "out" / "sub-ab").mkdir()
     (small / "out" / "sub-ab" / "thesis.txt").touch()
@@ -303,7 +246,7 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
 def test_what_is_chosen(only_failed, keys):
     states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "violated"}
     entries = [
-        cohort_plan.PlannedSubject(None, key, None, None, SubjectState(status, "")) for key, status in states.items()
+        cohort_plan.PlannedSubject(None, key, None, None, SubjectState(each, "")) for key, each in states.items()
     ]
     assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
 
@@ -312,26 +255,14 @@ def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
     said = refused(small, capsys, "--k-d", "1.5")
     assert len(said) == 1
     assert "t.tsv, line 2 and 1 more: --k-d: expected 0 <= k_D < 1, got 1.5" in said[0]
-
-
-def test_all_values_of_a_row_that_are_none_are_said(small, capsys):
+    assert "there is no {sub}; write {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
     (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
     (line,) = refused(small, capsys)
     assert 'nodes: "many" is no value of it; k-d: "0,9" is no value of it; write 0.9' in line
 
 
-def test_a_pattern_of_another_name_is_refused(small, capsys):
-    assert "there is no {sub}; write {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
-
-
-def test_a_folder_of_something_else_is_not_written_to(small, capsys):
-    (small / "out").mkdir()
-    (small / "out" / "thesis.txt").write_text("mine")
-    assert "no cohort's" in refused(small, capsys)[0]
-
-
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
-    begin(small / "out", description("test", []))
+    begin(small / "out")
     (small / "out" / ".work" / "lock").touch()
 
     def fail(*_):
@@ -364,7 +295,7 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
 def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
     """It does not begin here; jobs of a batch system may still have that memory."""
     monkeypatch.setattr(estimate_module, "available_bytes", lambda: 8e9)
-    estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)})
+    estimate = {"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)}
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
     assert [estimate_module.need_of(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
 
@@ -372,7 +303,7 @@ def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatc
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
     """It is written now and then: not at each subject, and again when its time has come."""
     place = tmp_path / "out"
-    begin(place, description("test", []))
+    begin(place)
     refresh = cohort_module._refresher(place)
     refresh()
     assert not (place / "cohort.html").exists()
@@ -392,21 +323,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
     keys = []
     monkeypatch.setattr(cohort_module, "locked", locked)
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
-    monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}))
+    monkeypatch.setattr(cohort_module, "estimated", lambda _: {})
     monkeypatch.setattr(cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run))
     exit_code("cohort", small / "t.tsv", "-o", small / "out")
     assert keys == ["sub-02"]
-
-
-def test_a_cohort_from_python_is_that_of_the_command(small):
-    """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
-    rows = tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, workers=1, iterations=1)
-    assert rows == {"sub-01": "done", "sub-02": "done"}
-    assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--iterations", "1", "--dry-run") == 0
-    events = []
-    tetopt.run_cohort(small / "t.tsv", str(small / "out"), on=events.append, iterations=1, dry_run=True)
-    assert events[-1] == ("note", "2 subjects: 2 done; 0 to run", None)
-    with pytest.raises(InputError, match="has no option 'noodes'; is nodes meant"):
-        tetopt.run_cohort(small / "t.tsv", small / "out", noodes=3)
-    with pytest.raises(InputError, match=r"^`nodes`: expected a whole number, got 'many'"):
-        tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")

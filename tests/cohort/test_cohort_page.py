@@ -28,14 +28,9 @@ def data_of(text):
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
 
 
-def test_the_three_files_lie_beside_the_subjects(cohort):
-    out, _ = cohort
-    assert sorted(path.name for path in out.glob("cohort.*")) == ["cohort.html", "cohort.json", "cohort.tsv"]
-    assert len((out / "cohort.tsv").read_text(encoding="utf-8").splitlines()) == 101
-
-
 def test_failures_are_on_top_with_their_logs(cohort):
-    _, text = cohort
+    out, text = cohort
+    assert sorted(path.name for path in out.glob("cohort.*")) == ["cohort.html", "cohort.json", "cohort.tsv"]
     assert "100 subjects: 94 done, 1 with a violated requirement, 4 failed, 1 not run." in text
     assert text.index("<h2>Failed: 4</h2>") < text.index("<h2>Distributions</h2>") < text.index("<h2>Subjects</h2>")
     failures = re.findall(r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", text[: text.index("<h2>Distributions")])
@@ -46,12 +41,6 @@ def test_failures_are_on_top_with_their_logs(cohort):
     assert [html.unescape(reason) for reason, _ in failures] == [early, killed]
     links = [re.findall(r'<a href="logs/([^"]*).log">([^<]*)</a>', names) for _, names in failures]
     assert links == [[(key_of(k), key_of(k)) for k in ks] for ks in ((2, 42), (22, 62))]
-
-
-def test_what_all_have_in_common_is_said_once(cohort):
-    _, text = cohort
-    assert "Of all meshes: tetopt 0.1.0, nodes 8000, k_D 0.85, method fast, young 3.0, format .vtu." in text
-    assert "options.nodes" not in {column["name"] for column in data_of(text)["columns"]}
 
 
 def test_what_differs_is_said_with_how_many(tmp_path):
@@ -130,7 +119,6 @@ def test_many_subjects_have_pictures_of_the_odd_and_of_a_sample(cohort, monkeypa
 def test_a_cohort_of_nothing_has_a_page(tmp_path):
     save_cohort_files(tmp_path, [])
     assert "0 subjects: none." in (tmp_path / "cohort.html").read_text(encoding="utf-8")
-    assert "0 subjects" in document(tmp_path / "cohort.html")
 
 
 # What a reader does, one step after the other, and what is there then.
@@ -156,6 +144,7 @@ pick("How", "pictures"); say(document.querySelectorAll(".tile img").length + " t
 </script>"""
 
 
+@pytest.mark.full
 def test_a_browser_sorts_and_filters(cohort, tmp_path):
     out, text = cohort
     made = document(copied(text, tmp_path / "a.html", FRAMES, STEPS))
@@ -186,6 +175,7 @@ for (const words of [bars[0], bars[bars.length - 1], ...feet])
 </script>"""
 
 
+@pytest.mark.full
 def test_a_bar_says_what_lies_beyond_it(tmp_path):
     """The bars at the ends hold what is far out, and say so, with the numbers themselves."""
     rng = np.random.default_rng(0)
@@ -209,11 +199,3 @@ def test_without_scripts_there_is_a_table(cohort):
     assert table.count("<tr>") == 101
     assert "orientation LPS: 94 of 95 have RAS" in table
     assert table.index("LPS") < table.index(key_of(0))
-
-
-def test_a_picture_that_is_none_of_ours_stays_out(tmp_path):
-    big = np.random.default_rng(0).bytes(40_000)
-    save_run(tmp_path, "sub-1", {"violated": {}}, big)
-    save_run(tmp_path, "sub-2", {"violated": {}}, thumbnail(np.random.default_rng(0)))
-    save_cohort_files(tmp_path, collect(tmp_path))
-    assert list(data_of((tmp_path / "cohort.html").read_text(encoding="utf-8"))["pictures"]) == ["1"]

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from tetopt.cohort.layout import begin, check_out, description, locked, publish, restore, subject_folder
+from tetopt.cohort.layout import begin, check_out, locked, publish, restore, subject_folder
 from tetopt.errors import InputError
 
 
 @pytest.fixture
 def out(tmp_path):
-    begin(tmp_path / "out", description("test", ["/bids"]))
+    begin(tmp_path / "out", ["/bids"])
     return tmp_path / "out"
 
 
@@ -129,13 +129,3 @@ def test_what_a_user_has_put_beside_a_mesh_outlives_a_crash(out, is_published_ag
     assert (place / "note.txt").read_text() == "mine"
     assert (place / "a.txt").read_text() == ("newer" if is_published_again else "new")
     assert not aside.exists()
-
-
-def test_what_an_earlier_crash_has_put_aside_is_not_in_the_way(out):
-    """A run beside others restores its own subjects alone, and may find this after its last look."""
-    publish(work_of(out, "sub-1", "second"), out, "sub-1")
-    (out / ".work" / "sub-1.before").mkdir()
-    (out / ".work" / "sub-1.before" / "a.txt").write_text("first")
-    publish(work_of(out, "sub-1", "third"), out, "sub-1")
-    assert (out / "sub-1" / "a.txt").read_text() == "third"
-    assert not [each for each in (out / ".work").iterdir() if each.is_dir()]

@@ -1,17 +1,21 @@
 """One subject's run: whole or not at all, the same bytes as `tetopt mesh`, and why it failed."""
 
+import contextlib
 import json
 import os
+import shutil
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
-from tetopt.cohort.layout import begin, description, failure_path, log_path, numbers_path, subject_folder
+from tetopt.cohort.layout import begin, failure_path, log_path, numbers_path, subject_folder
 from tetopt.cohort.run import SubjectTask, _reason, run_subject
 
 WORDS = ("--nodes=60", "--iterations=1", "--")
@@ -24,23 +28,33 @@ def image(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def job(tmp_path, image):
-    out = tmp_path / "out"
-    begin(out, description("test", []))
+def job_in(out, image):
+    begin(out)
     (out / ".work" / "run-1").touch()
     return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, 0.0, "run-1")
 
 
-def test_a_subject_is_what_mesh_alone_writes(job, image, tmp_path):
+@pytest.fixture
+def job(tmp_path, image):
+    return job_in(tmp_path / "out", image)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory, image):
+    """A subject that was run, and how it ended."""
+    job = job_in(tmp_path_factory.mktemp("done") / "out", image)
+    failure_path(Path(job.out), "sub-1").write_text("{}")  # of a run before
+    return job, run_subject(job)
+
+
+@pytest.mark.full
+def test_a_subject_is_what_mesh_alone_writes(done, image, tmp_path):
     """To the byte, but for what differs from run to run: seconds, memory."""
-    out = tmp_path / "out"
-    ended = run_subject(job)
+    job, ended = done
+    out = Path(job.out)
     assert (ended.status, ended.reason) == ("done", "")
-    folder = subject_folder(out, "sub-1")
-    alone = tmp_path / "alone"
+    folder, alone, name = subject_folder(out, "sub-1"), tmp_path / "alone", "sub-1_desc-tetopt_mesh"
     (alone / "figures").mkdir(parents=True)
-    name = "sub-1_desc-tetopt_mesh"
     outputs = ["-o", alone / f"{name}.vtu", "--json", alone / f"{name}.json", "--figures", alone / "figures"]
     assert exit_code("mesh", *WORDS[:-1], *outputs, "--threads", "1", image) == 0
     names = sorted(str(path.relative_to(alone)) for path in alone.rglob("*"))
@@ -57,19 +71,26 @@ def test_a_subject_is_what_mesh_alone_writes(job, image, tmp_path):
     assert not failure_path(out, "sub-1").exists()
 
 
-def test_a_refused_subject_is_one_line_and_no_files(job, tmp_path):
-    image = tmp_path / "cut.nii.gz"
-    image.write_bytes(b"\x1f\x8b\x08 no more")
-    ended = run_subject(job._replace(words=(*WORDS, str(image))))
+@pytest.mark.full
+def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, image, tmp_path):
+    """A log that is a file of two names is another file afterwards."""
+    job = done[0]._replace(out=str(shutil.copytree(done[0].out, tmp_path / "out")))
+    out = Path(job.out)
+    before = numbers_path(out, "sub-1").read_bytes()
+    (tmp_path / "notes.txt").write_text("years of work")
+    log_path(out, "sub-1").unlink()
+    os.link(tmp_path / "notes.txt", log_path(out, "sub-1"))
+    ended = run_subject(job._replace(words=("--nodes=0", *job.words[1:])))
     assert ended.status == "failed"
-    assert ended.reason.startswith(f"{image}: ")
-    out = tmp_path / "out"
-    assert not subject_folder(out, "sub-1").exists()
+    assert "nodes" in ended.reason
     failure = json.loads(failure_path(out, "sub-1").read_text())
     assert (failure["reason"], failure["attempts"]) == (ended.reason, 1)
     assert ended.reason in log_path(out, "sub-1").read_text()
+    assert numbers_path(out, "sub-1").read_bytes() == before
+    assert (tmp_path / "notes.txt").read_text() == "years of work"
 
 
+@pytest.mark.full
 def test_a_mesh_that_violates_a_requirement_is_a_mesh(job, tmp_path):
     """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1."""
     inside = np.zeros((24, 24, 24))
@@ -93,35 +114,14 @@ def test_the_reason_is_the_last_line_that_says_one(tmp_path, text, reason):
     assert _reason(tmp_path / "a.log", 2) == reason
 
 
-def test_what_was_there_stays_where_a_run_fails(job, tmp_path):
-    out = tmp_path / "out"
-    run_subject(job)
-    before = numbers_path(out, "sub-1").read_bytes()
-    assert run_subject(job._replace(words=("--nodes=0", *job.words[1:]))).status == "failed"
-    assert numbers_path(out, "sub-1").read_bytes() == before
-    assert run_subject(job).status == "done"
-    assert not failure_path(out, "sub-1").exists()
-
-
-def test_a_log_with_a_second_name_is_not_written_to(job, tmp_path):
-    (tmp_path / "notes.txt").write_text("years of work")
-    os.link(tmp_path / "notes.txt", log_path(tmp_path / "out", "sub-1"))
-    assert run_subject(job._replace(words=("--nodes=0", *job.words[1:]))).status == "failed"
-    assert (tmp_path / "notes.txt").read_text() == "years of work"
-
-
 def processes_of(folder):
     """The runs of a cohort's folder that are under way."""
     found = []
-    for process in os.listdir("/proc"):
-        if process.isdigit():
-            try:
-                with open(f"/proc/{process}/cmdline", "rb") as stream:
-                    words = stream.read()
-            except OSError:
-                continue
-            if b"tetopt\0mesh" in words and os.fsencode(folder) in words:
-                found.append(int(process))
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            words = process.cmdline()
+            if "mesh" in words and any(word.startswith(folder) for word in words):
+                found.append(process.pid)
     return found
 
 
@@ -140,6 +140,7 @@ def with_a_run_under_way(job, action):
     return ended[0], len(seen)
 
 
+@pytest.mark.deep
 def test_a_killed_run_is_repeated_once(job, tmp_path):
     ended, n_runs = with_a_run_under_way(job, lambda process: os.kill(process, signal.SIGKILL))
     assert n_runs == 2
@@ -149,6 +150,7 @@ def test_a_killed_run_is_repeated_once(job, tmp_path):
     assert not [each for each in (tmp_path / "out" / ".work").iterdir() if each.is_dir()]
 
 
+@pytest.mark.deep
 def test_a_run_that_is_given_up_ends(job, tmp_path):
     """As when Ctrl-C has ended the cohort: workers of a cluster do not hear it."""
     ended, n_runs = with_a_run_under_way(job, lambda _: (tmp_path / "out" / ".work" / "run-1").unlink())

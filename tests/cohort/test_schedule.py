@@ -10,7 +10,7 @@ from distributed import Client, KilledWorker, LocalCluster
 
 from tetopt.cluster import tasks
 from tetopt.cluster.tasks import SchedulerLost
-from tetopt.cohort.layout import begin, description, failure_path
+from tetopt.cohort.layout import begin, failure_path
 from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 
@@ -65,7 +65,7 @@ class FakeClient:
 @pytest.fixture
 def play(tmp_path, monkeypatch):
     """A function that runs subjects a, b, ... through the loop: how they ended."""
-    begin(tmp_path / "out", description("test", []))
+    begin(tmp_path / "out")
 
     def run(client, letters="abcd", slots=lambda: 2, room=GB, n_bytes=None):
         monkeypatch.setattr(distributed, "wait", client.wait)

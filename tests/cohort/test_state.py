@@ -5,7 +5,7 @@ import json
 import pytest
 from cohorts import save_failure, save_run
 
-from tetopt.cohort.layout import begin, description, mesh_name, numbers_path, subject_folder
+from tetopt.cohort.layout import begin, mesh_name, numbers_path, subject_folder
 from tetopt.cohort.state import SubjectState, differences, foreign_files, state_of
 
 KEY = "sub-1"
@@ -18,7 +18,7 @@ def request(**changes):
 
 @pytest.fixture
 def out(tmp_path):
-    begin(tmp_path / "out", description("test", []))
+    begin(tmp_path / "out")
     return tmp_path / "out"
 
 

@@ -17,6 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import psutil
+
 from tetopt.io.mni import mni_path
 
 LEAVE_SECONDS = 60.0  # until a killed client's workers have gone
@@ -67,7 +69,7 @@ class Run:
 
     def workers(self):
         """The numbers of its worker processes."""
-        return [number for number, words in processes(self.mark).items() if b"spawn_main" in words]
+        return [number for number, words in processes(self.mark).items() if "spawn_main" in words]
 
     def end(self):
         """Its exit code."""
@@ -80,10 +82,10 @@ class Run:
 def processes(mark):
     """Processes of a run, by number: their words."""
     result = {}
-    for each in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            if f"{MARK}={mark}".encode() in (each / "environ").read_bytes():
-                result[int(each.name)] = (each / "cmdline").read_bytes()
+    for each in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if each.environ().get(MARK) == mark:
+                result[each.pid] = " ".join(each.cmdline())
     return result
 
 

@@ -154,12 +154,6 @@ def test_parts_add_up_to_the_whole(run, image):
         assert record.n_cells == len(mesh.cells)
 
 
-def test_what_a_part_begins_with_is_its_part_of_what_the_round_before_ended_with(run):
-    history = run[0].result.history
-    for before, parts in zip(history, rounds_of(run, "improve"), strict=False):
-        assert sum(part.numbers["E_before"] for part in parts) == pytest.approx(before.E, rel=1e-11)
-
-
 def test_a_part_sees_its_own_box_of_voxels_alone(run, image):
     sizes = [np.ptp(part.before["ticks"] >> part.text["settings"]["bits"], axis=0).prod() for part in run[1][1]]
     assert max(sizes) < 0.5 * image.data.size

@@ -19,7 +19,7 @@ from commands import exit_code, numbers_in
 
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.workers import workers
-from tetopt.cohort.layout import begin, description, numbers_path
+from tetopt.cohort.layout import begin, numbers_path
 from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 from tetopt.io.meshes import load_mesh
@@ -182,7 +182,7 @@ def test_jobs_that_end_are_replaced(slurm, tmp_path):
         return Ended(job.key, "done", os.environ["SLURM_JOB_ID"], 0.0, 0)
 
     out = tmp_path / "out"
-    begin(out, description("test", []))
+    begin(out)
     jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, 1.0, "run-1") for k in range(1, 5)]
     before = set(jobs_of_slurm())
     folders = Folders(out / ".work", out / "logs")

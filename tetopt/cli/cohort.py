@@ -60,17 +60,18 @@ def _say_estimate(plan: CohortPlan) -> None:
     """What would be run, and what it takes."""
     to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
     for entry in to_run:
-        if (one := estimate.each.get(entry.key)) is None:
+        if (one := estimate.get(entry.key)) is None:
             out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
         else:
             out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
-    whole = f"in all {time_words(estimate.seconds())} on one thread, at most {memory_words(estimate.largest())} each"
+    seconds = sum(one.seconds for one in estimate.values())
+    peak = max((one.peak_bytes for one in estimate.values()), default=0.0)
+    whole = f"in all {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
         out.print(f"{whole}; divided by as many as the cluster runs at a time" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
-    seconds = time_words(estimate.seconds() / n_workers)
-    out.print(f"{whole}; on this machine {n_workers} at a time: about {seconds}")
+    out.print(f"{whole}; on this machine {n_workers} at a time: about {time_words(seconds / n_workers)}")
 
 
 class _CohortDisplay:

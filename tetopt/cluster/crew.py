@@ -29,7 +29,8 @@ WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("targ
     "distributed.worker.memory.terminate": TERMINATE_FRACTION,
     "distributed.scheduler.worker-ttl": None,
 }
-DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
+# Dask's own port, which its users know, or another where that is taken; to this machine only: it shows tasks' names.
+DASHBOARD_ADDRESS = "127.0.0.1:8787"
 
 
 class Need(NamedTuple):
@@ -170,42 +171,34 @@ class Newcomers:
             )
 
 
-def limiter() -> Any:
-    """A plugin by which an allocation that would take a worker over its limit of memory fails, where systems have that.
+def beginning(is_within: bool, log: Path | None = None) -> Any:
+    """A plugin that sets up workers as they begin, also those that are started again.
 
-    And by which it ends with its nanny, whatever it does just then.
-    A nanny ends its worker after the fact, when it next looks. RLIMIT_DATA counts what the process may write to and
-    has not got from a file, touched or not; files' pages, which can be had again, count for the nanny alone.
+    With `is_within` an allocation that would take a worker over its limit of memory fails, where systems have that, and
+    a worker ends with its nanny, whatever it does just then. A nanny ends its worker after the fact, when it next
+    looks. RLIMIT_DATA counts what the process may write to and has not got from a file, touched or not; files' pages,
+    which can be had again, count for the nanny alone. What a worker would write to the terminal goes to the end of
+    `log`.
     """
     from distributed import WorkerPlugin
 
-    class Limiter(WorkerPlugin):
+    class Beginning(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            end_with_parent()
-            limit = worker.memory_manager.memory_limit
-            if limit:
-                limit_self("RLIMIT_DATA", limit)
+            if log is not None:
+                descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+                os.dup2(descriptor, 1)
+                os.dup2(descriptor, 2)
+                os.close(descriptor)
+            if is_within:
+                end_with_parent()
+                if limit := worker.memory_manager.memory_limit:
+                    limit_self("RLIMIT_DATA", limit)
 
-    return Limiter()
-
-
-def slots_of(client: Any) -> int:
-    """The threads of all workers that are there: each runs one task at a time."""
-    return sum(client.nthreads().values())
-
-
-def dashboard_address() -> str:
-    """Where the dashboard answers, to this machine only: it shows the tasks' names."""
-    with socket.socket() as one:
-        try:
-            one.bind(("127.0.0.1", DASHBOARD_PORT))
-        except OSError:
-            return "127.0.0.1:0"
-    return f"127.0.0.1:{DASHBOARD_PORT}"
+    return Beginning()
 
 
 def dashboard_link(client: Any) -> str:
-    """The page that answers at `dashboard_address`; dask's own words have the scheduler's name in it."""
+    """The page that answers there; dask's own words have the scheduler's name in it."""
     return f"http://127.0.0.1:{client.scheduler_info()['services']['dashboard']}/status"
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import shutil
 import signal
 import threading
@@ -21,16 +20,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.cluster.crew import (
+    DASHBOARD_ADDRESS,
     MEMORY_MARGIN,
     About,
     Folders,
     Need,
     Newcomers,
     Workers,
+    beginning,
     counted,
-    dashboard_address,
-    limiter,
-    slots_of,
 )
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
@@ -40,6 +38,8 @@ from tetopt.system.interpreter import THREADS_NAME, safe_path
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
+# A nanny starts its worker again, on a busy machine for longer than the 15 s after which dask would close both.
+LOST_SETTINGS = {"distributed.deploy.lost-worker-timeout": "24h"}
 LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # of what speaks in dask
 DASK_PACKAGES = ("distributed", "dask-jobqueue", "bokeh", "cryptography")  # of the extras "cohort" and "blocks"
 
@@ -155,7 +155,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
 
     share = local_share(need, count)
     stack.enter_context(safe_path())
-    stack.enter_context(dask.config.set(need.settings()))
+    stack.enter_context(dask.config.set(need.settings() | LOST_SETTINGS))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
     # Where a task is a process of its own the worker is small, and its limit would not be that process's.
@@ -167,21 +167,19 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
             security=True,
             memory_limit=limit,
             local_directory=str(own_folder),
-            dashboard_address=dashboard_address(),
+            dashboard_address=DASHBOARD_ADDRESS,
             env={THREADS_NAME: str(share.threads)} if need.is_within else None,
         )
     )
     if need.is_within:
         stack.callback(cluster.sync, _closed, cluster)
     client = stack.enter_context(Client(cluster))
-    client.register_plugin(_silencer(folders.logs / "dask.log"))
-    if need.is_within:
-        client.register_plugin(limiter())
+    client.register_plugin(beginning(need.is_within, folders.logs / "dask.log"))
     words = f"{counted(share.workers, 'worker')} of {counted(share.threads, 'thread')}"
     if share.bytes < float("inf"):
         words += f" and {memory_words(share.bytes)}"
     words += f"; dashboard {client.dashboard_link}"
-    return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words, share.limit)
+    return Workers(client, lambda: sum(client.nthreads().values()), share.threads, share.bytes, words, share.limit)
 
 
 async def _closed(cluster: Any) -> None:
@@ -266,22 +264,10 @@ def _quiet(log: Path) -> Iterator[None]:
             before.append((logger, logger.handlers, logger.propagate))
             logger.handlers, logger.propagate = [handler], False
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Port .* is already in use")  # of the dashboard, where another run's is
+            yield
     finally:
         for logger, handlers, propagate in before:
             logger.handlers, logger.propagate = handlers, propagate
         handler.close()
-
-
-def _silencer(log: Path) -> Any:
-    """A plugin by which workers, also those started again, write what they would have to the terminal into a file."""
-    from distributed import WorkerPlugin
-
-    class Silencer(WorkerPlugin):
-        def setup(self, worker: Any) -> None:
-            descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            os.dup2(descriptor, 1)
-            os.dup2(descriptor, 2)
-            os.close(descriptor)
-
-    return Silencer()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tetopt.cohort.layout import DESCRIPTION_NAME
 from tetopt.cohort.subjects import Problems, Subject
@@ -81,7 +81,7 @@ def bids_subjects(
     K. J. Gorgolewski et al., The brain imaging data structure, Scientific Data 3, 160044 (2016).
     """
     folder = Path(folder).absolute()
-    dataset_description(folder)
+    _check_dataset(folder)
     kind = _kind(suffix)
     labels = [label.removeprefix("sub-") for label in participants]
     visits = {label.removeprefix("ses-") for label in sessions}
@@ -103,14 +103,8 @@ def bids_subjects(
     return [_subject(scan, folder) for scan in chosen]
 
 
-def dataset_description(folder: Path) -> dict[str, Any]:
-    """What a BIDS folder says of itself.
-
-    Raises
-    ------
-    InputError
-        It is no folder, or has no `dataset_description.json` that holds a table.
-    """
+def _check_dataset(folder: Path) -> None:
+    """InputError for what is no folder, or has no `dataset_description.json` that holds a table."""
     file = folder / DESCRIPTION_NAME
     if not folder.is_dir():
         raise InputError(f"{_shown(folder)}: no such folder; expected a BIDS dataset")
@@ -123,7 +117,6 @@ def dataset_description(folder: Path) -> dict[str, Any]:
         raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; mend that place") from error
     if not isinstance(table, dict):
         raise InputError(f"{_shown(file)}: expected a table in JSON, got {type(table).__name__}")
-    return table
 
 
 def _kind(suffix: str) -> Name:

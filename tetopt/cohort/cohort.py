@@ -18,7 +18,6 @@ from tetopt.cohort.layout import (
     WORK_NAME,
     begin,
     check_out,
-    description,
     failure_path,
     locked,
     not_our_files,
@@ -163,7 +162,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
         with locked(place, []):  # said here as well, as the plan of many subjects takes minutes
             pass
     rows = subjects_of(subjects, cohort)
-    plan = CohortPlan(subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], Estimate({}))
+    plan = CohortPlan(subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], {})
     if cohort.collect:
         if problems := [wrong for each in plan.keys if (wrong := not_our_files(place, each)) is not None]:
             raise Problems(problems)
@@ -200,7 +199,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
     place, keys, cohort = plan.place, plan.keys, plan.cohort
     # Beside runs of others, one folder's.
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
-    begin(place, description("Tetrahedral meshes by tetopt", [plan.subjects.absolute().as_uri()]))
+    begin(place, [plan.subjects.absolute().as_uri()])
     with locked(place, alone):
         restore(place, alone)
         # Once more: another run may have ended since.
@@ -266,7 +265,7 @@ def _refresher(place: Path) -> Callable[[], None]:
 
 
 def _job(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
-    one = estimate.each.get(entry.key, Prediction(0.0, 0.0, 0.0))
+    one = estimate.get(entry.key, Prediction(0.0, 0.0, 0.0))
     return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
 
 

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
 from io import StringIO
-from typing import NamedTuple
 
 from tetopt.cluster.workers import Need
 from tetopt.cohort.options import CohortOptions
@@ -24,18 +23,7 @@ from tetopt.system.budget import available_bytes
 LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
 
 
-class Estimate(NamedTuple):
-    """What the subjects that are to be run are predicted to take."""
-
-    each: dict[str, Prediction]  # by key, on one thread
-
-    def largest(self) -> float:
-        """Bytes of the one that takes most, 0 of none."""
-        return max((prediction.peak_bytes for prediction in self.each.values()), default=0.0)
-
-    def seconds(self) -> float:
-        """Of all, one after the other."""
-        return sum(prediction.seconds for prediction in self.each.values())
+Estimate = dict[str, Prediction]  # what subjects are predicted to take, by key, each on one thread
 
 
 def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
@@ -47,7 +35,7 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
     speed = calibrated_speed() if entries else 1.0
     like: dict[tuple[object, ...], dict[tuple[int, ...], RunSize]] = {}
     reads: Counter[tuple[object, ...]] = Counter()
-    each = {}
+    estimate = {}
     for entry in entries:
         job = entry.job
         files = len(job.images), job.mask is None, job.labels is None
@@ -60,10 +48,10 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
                 if (size := _read_size(entry)) is not None:
                     known[shape] = size
             nearest = known.get(shape) or next(iter(known.values()), None)
-            each[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
+            estimate[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
         except InputError:  # its run will say it
             continue
-    return Estimate(each)
+    return estimate
 
 
 def _read_size(entry: PlannedSubject) -> RunSize | None:
@@ -77,7 +65,7 @@ def _read_size(entry: PlannedSubject) -> RunSize | None:
 
 def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
     """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
-    sizes = [each.peak_bytes for each in estimate.each.values()]
+    sizes = [each.peak_bytes for each in estimate.values()]
     if cohort.scheduler is None and cohort.cluster is None:
         free = available_bytes()
         sizes = [each for each in sizes if each <= free]

@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import stat
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -135,26 +136,21 @@ def is_cohort(out: Path) -> bool:
     return isinstance(makers, list) and any(isinstance(each, dict) and each.get("Name") == "tetopt" for each in makers)
 
 
-def begin(out: Path, description: dict[str, Any]) -> None:
-    """Make the folder, and set down whose it is, if it is new."""
+def begin(out: Path, sources: Sequence[str] = ()) -> None:
+    """Make the folder, and set down whose it is and of which data, if it is new: BIDS 1.10, of a derivative."""
     out.mkdir(exist_ok=True)
     (out / LOGS_NAME).mkdir(exist_ok=True)
     create(out / WORK_NAME, WORK)
-    if not (out / DESCRIPTION_NAME).exists():
-        save_json(out / DESCRIPTION_NAME, description)
-        # BIDS has no names for meshes of volumes yet, nor for pages and logs; its patterns of folders have no "/".
-        (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
-
-
-def description(name: str, sources: list[str]) -> dict[str, Any]:
-    """What dataset_description.json says: BIDS 1.10, Dataset description, of a derivative."""
-    return {
-        "Name": name,
-        "BIDSVersion": BIDS_VERSION,
-        "DatasetType": "derivative",
+    if (out / DESCRIPTION_NAME).exists():
+        return
+    description = {
+        "Name": "Tetrahedral meshes by tetopt", "BIDSVersion": BIDS_VERSION, "DatasetType": "derivative",
         "GeneratedBy": [{"Name": "tetopt", "Version": tetopt.__version__}],
         "SourceDatasets": [{"URL": source} for source in sources],
-    }
+    }  # fmt: skip
+    save_json(out / DESCRIPTION_NAME, description)
+    # BIDS has no names for meshes of volumes yet, nor for pages and logs; its patterns of folders have no "/".
+    (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
 
 
 def locked(out: Path, keys: list[str] | None = None) -> AbstractContextManager[None]:

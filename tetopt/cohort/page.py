@@ -177,7 +177,8 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
     quantities = {each.column: each for each in QUANTITIES}
     columns = {name: quantities.get(name) for name in dict.fromkeys((*FIRST_COLUMNS, *quantities, *PAGE_COLUMNS))}
     shown = {
-        name: quantity or Quantity(name, PAGE_COLUMNS[name], _unit(name), "both", False, 0.0)
+        name: quantity
+        or Quantity(name, PAGE_COLUMNS[name], "bytes" if name.endswith("_bytes") else "", "both", False, 0.0)
         for name, quantity in columns.items()
         if name in known
     }
@@ -190,10 +191,6 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
     labels = sorted(number for number, _ in counts.most_common(room))
     shown |= {each.column: each for number in labels for each in label_quantities(number, names)}
     return shown, len(counts) - len(labels)
-
-
-def _unit(name: str) -> str:
-    return "bytes" if name.endswith("_bytes") else ""
 
 
 def _data(

@@ -137,14 +137,10 @@ class _Plans:
                 raise InputError("threads: all subjects have the same number, of `threads`; leave the column out")
             own = with_options(self._options, {name.replace("_", "-"): text for name, text in subject.options.items()})
             own = replace(own, **files)
-            self._known[kind] = own, resolved(job_of(own, subject.images, self._output))
+            places: dict[str, Any] = {"output": self._output, "figures": Path(FIGURES_NAME)}
+            self._known[kind] = own, resolved(JobOptions(images=list(subject.images), **places, **vars(own)))
         own, plan = self._known[kind]
         return replace(own, **files), plan.with_files(subject.images, files)
-
-
-def job_of(options: RunOptions, images: Sequence[Path], output: Path) -> JobOptions:
-    """All options of the run of a subject."""
-    return JobOptions(images=list(images), output=output, figures=Path(FIGURES_NAME), **vars(options))
 
 
 def _missing(job: JobOptions) -> Iterator[str]:

@@ -24,9 +24,7 @@ from tetopt.mesh import Mesh
 from tetopt.parts.work import checksum, done_path, load_arrays, open_volume, save_arrays
 from tetopt.start.sizes import Sizes
 
-MARGIN_SIZE = (
-    2  # voxels around a part's nodes: as far as the image is looked at to either side of a facet, and one more
-)
+MARGIN_SIZE = 2  # voxels around a part's nodes: as far as the image is looked at beside a facet, and one more
 
 Kind = Literal["measure", "improve", "fields"]
 
@@ -61,12 +59,9 @@ class Numbers(NamedTuple):
     n_voxels: int
     n_nodes: int
     movement: float  # of the last iteration, as in a `IterationRecord`
-    E_before: float  # its part of the whole's, to begin with
 
 
-def box_of_ticks(
-    ticks: NDArray[np.int64], settings: PartSettings
-) -> tuple[tuple[int, ...], tuple[int, ...]]:  # fmt: skip
+def box_of_ticks(ticks: NDArray[np.int64], settings: PartSettings) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The voxels of a part, start to before stop (3,) each: those around its nodes, within the image."""
     index = ticks * 2.0**-settings.bits
     start = np.maximum(np.floor(index.min(axis=0)).astype(np.int64) - MARGIN_SIZE, 0)
@@ -97,7 +92,7 @@ def work_on(name: str) -> Numbers:
     if text["kind"] == "fields":
         centroids = stored.to_world(arrays["ticks"] * 2.0**-settings.bits)[mesh.cells].mean(axis=1)
         nearest = nearest_voxels(stored, centroids) - np.array(start)
-        result, numbers = _fields(image, mesh, whole, nearest), Numbers(of, 0.0, 0.0, 0.0, 0.0, 0, len(index), 0.0, 0.0)
+        result, numbers = _fields(image, mesh, whole, nearest), Numbers(of, 0.0, 0.0, 0.0, 0.0, 0, len(index), 0.0)
     else:
         result, numbers = _improved(image, mesh, whole, settings, text)
         numbers = numbers._replace(of=of)
@@ -144,7 +139,7 @@ def _improved(
     E_G, squares = content_energies(run.state, run.content)
     numbers = Numbers(
         "", history[-1].E, E_G, history[-1].E_D, squares, history[-1].n_voxels, len(run.state.complex.ticks),
-        history[-1].movement, history[0].E,
+        history[-1].movement,
     )  # fmt: skip
     ticks = run.state.complex.ticks + (np.array(whole.start, dtype=np.int64) << whole.bits)
     return {"ticks": ticks, "cells": np.array(run.cells)}, numbers

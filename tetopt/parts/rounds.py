@@ -38,9 +38,9 @@ from tetopt.parts.work import (
     done_path,
     gone_if_refused,
     load_arrays,
-    load_mesh_of,
     load_state,
     locked,
+    mesh_path,
     open_volume,
     round_folder,
     save_arrays,
@@ -83,7 +83,6 @@ class Round(NamedTuple):
     kind: Kind
     n_parts: int
     done: int  # parts of it that are done
-    task_bytes: float  # the most memory that one of them takes, by prediction
 
 
 class Parted(NamedTuple):
@@ -92,8 +91,6 @@ class Parted(NamedTuple):
     result: MeshingResult  # with a record for each round
     fields: dict[str, NDArray]  # of each cell what the image is there: n_voxels, mean, variance, min, max
     part: NDArray[np.int64]  # (M,) of each cell, rising
-    statistics: Statistics  # of the image
-    image: Image
 
 
 def in_turn(names: Sequence[str]) -> Iterator[Any]:
@@ -158,14 +155,14 @@ def mesh_in_parts(
             ended = "iterations"
             # Asked before a round, also of a run that went on: it may have ended when it had converged.
             while not _is_converged(request, state) and state.n_rounds <= _n_rounds(request):
-                after = _round(run, state, counts, runner, largest)
+                after = _round(run, state, counts, runner)
                 if after is None:
                     ended = "stopped"
                     break
                 state = after
             if _is_converged(request, state):
                 ended = "converged"
-            return _finished(run, state, counts, in_turn if ended == "stopped" else runner, ended, largest)
+            return _finished(run, state, counts, in_turn if ended == "stopped" else runner, ended)
 
 
 class _Run(NamedTuple):
@@ -195,8 +192,8 @@ def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics 
         _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_FRACTION * request.iterations) if request.k_D > 0.0 else 0,
         sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, of_image.noise,
     )  # fmt: skip
-    noted = {"settings": settings._asdict(), "statistics": of_image._asdict(), "history": []}
-    state = WorkState(request.checksum, 0, noted | {"seconds": time.perf_counter() - begin})
+    noted = {"settings": settings._asdict(), "history": [], "seconds": time.perf_counter() - begin}
+    state = WorkState(request.checksum, 0, noted)
     arrays = {"ticks": ticks, "cells": mesh.cells}
     save_arrays(folder / INITIAL_NAME, arrays, {})
     save_state(folder, state, arrays)
@@ -213,7 +210,7 @@ def _history(state: WorkState) -> list[IterationRecord]:
 
 def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> list[Piece]:
     """The parts of the mesh as it stands."""
-    mesh = load_mesh_of(run.folder, state)
+    mesh = load_arrays(mesh_path(run.folder, state.n_rounds))[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     part = cut(index[mesh["cells"]].mean(axis=1), _weights(index, mesh["cells"]), counts, shift)
     return pieces(Shared(mesh["ticks"], mesh["cells"], part))
@@ -253,13 +250,13 @@ def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterato
         yield int(BOX_EXCESS * n_voxels), len(piece.cells)
 
 
-def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, task_bytes: float) -> WorkState | None:
+def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner) -> WorkState | None:
     """One round; None if it was cut short."""
     number = state.n_rounds
     kind: Kind = "measure" if number == 0 else "improve"
     parts = _cut(run, state, counts, ROUND_SHIFTS[max(number - 1, 0) % len(ROUND_SHIFTS)])
     paths = _prepared(run, state, parts, kind)
-    now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0, task_bytes)
+    now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0)
     if not _is_run(run, state, now, parts, paths, runner):
         return None
     arrays, numbers = zip(*(load_arrays(done_path(path)) for path in paths), strict=True)
@@ -329,9 +326,7 @@ def _is_converged(request: PartsRequest, state: WorkState) -> bool:
     return 1.0 - history[-1].E / history[-2].E < request.tolerance * ROUND_SWEEPS
 
 
-def _finished(
-    run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str, task_bytes: float
-) -> Parted:  # fmt: skip
+def _finished(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str) -> Parted:
     """The result of the rounds that are complete, its cells in the order of the parts that took their fields."""
     history = _history(state)
     if not history:
@@ -339,7 +334,7 @@ def _finished(
     parts = _cut(run, state, counts, ROUND_SHIFTS[0])
     whole = run._replace(is_over=lambda: False)
     paths = _prepared(run, state, parts, "fields")
-    now = Round(state.n_rounds, _n_rounds(run.request) + 2, "fields", len(parts), 0, task_bytes)
+    now = Round(state.n_rounds, _n_rounds(run.request) + 2, "fields", len(parts), 0)
     if not _is_run(whole, state, now, parts, paths, runner):  # it knows of the end as well, and begins no more parts
         _is_run(whole, state, now, parts, paths, in_turn)
     done = [load_arrays(done_path(path))[0] for path in paths]
@@ -352,4 +347,4 @@ def _finished(
         seconds_run=time.perf_counter() - run.begin,
     )  # fmt: skip
     result = checked_in_box(result, run.image, run.request.min_dihedral)
-    return Parted(result, fields, mesh.part, Statistics(**state.known["statistics"]), run.image)
+    return Parted(result, fields, mesh.part)

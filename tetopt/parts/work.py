@@ -214,11 +214,6 @@ def load_state(folder: Path, request: str) -> WorkState | None:
     return state
 
 
-def load_mesh_of(folder: Path, state: WorkState) -> dict[str, NDArray]:
-    """The mesh after the last complete round."""
-    return load_arrays(mesh_path(folder, state.n_rounds))[0]
-
-
 def mesh_path(folder: Path, number: int) -> Path:
     """Where the mesh after so many rounds is."""
     return folder / f"mesh-{number}.npz"
