@@ -13,6 +13,8 @@ from models import sample_image
 from tetopt.io.images import save_image
 from tetopt.system.interpreter import others_environment
 
+pytestmark = pytest.mark.deep
+
 MODULES = sorted(name for name in sys.stdlib_module_names | packages_distributions().keys() if name.isidentifier())
 PLANTED = "import os\nopen({path!r}, 'a').write(__name__ + ' ')\n"
 COMMANDS = {  # and the kernels' compilers: tests/test_kernels.py

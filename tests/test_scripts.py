@@ -14,6 +14,8 @@ import tetopt
 from tetopt.engine.cost import RunSize, cost_model, memory_terms, once_terms, swept_terms
 from tetopt.geometry.topology import components
 
+pytestmark = pytest.mark.deep
+
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
