@@ -12,7 +12,7 @@ import tetopt
 from tetopt.cli import run as cli_run
 from tetopt.model.sets import nodes_of
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 
 
 @pytest.fixture(scope="module")

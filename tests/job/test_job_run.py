@@ -11,7 +11,7 @@ import tetopt
 from tetopt.io.formats import FORMATS
 from tetopt.job.events import listened, note
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
 OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
