@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numba
@@ -62,4 +63,18 @@ def described_numbers():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tetopt.system.files, "save_text", checked)
+        yield
+
+
+@pytest.fixture(scope="module")
+def read_here():
+    """Meshes are read in this process: the child of each takes a third of a second, and `tests/io` sees it at work."""
+
+    def read_in_place(read, path, *rest, **_):
+        with warnings.catch_warnings(action="ignore"):  # which nobody hears in a child
+            return read(str(path), *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("read_vtk", "read_gmsh", "vtkhdf", "frd"):
+            patch.setattr(f"tetopt.io.{name}.read_apart", read_in_place)
         yield

@@ -52,7 +52,7 @@ def unusual(n):
     }
 
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [pytest.mark.full, pytest.mark.filterwarnings("error::RuntimeWarning")]
 CASES = [(n, name) for n in (2, 3) for name in unusual(2)]
 
 

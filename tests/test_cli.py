@@ -27,7 +27,6 @@ import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
-from tetopt.contents.phantom import phantom_names
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import FORMER_NAMES
 from tetopt.geometry.simplex import volumes
@@ -38,6 +37,7 @@ from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 OBLIQUE_TOML = """
 name = "oblique"
 description = "A sphere of 9 mm off the middle of thick, oblique, sheared, flipped slices"
@@ -128,11 +128,6 @@ def test_mesh_in_3d(run):
 
 
 SIZES = ("size_min", "edge_size", "edge_max", "gradation", "sizing")
-OPTIONS_OF_A_RUN = {
-    *("nodes", "target_error", "spacing", "lattice", *SIZES, "start"),
-    *("volume", "crop", "slice", "method", "max_seconds", "max_gb", "k_D", "iterations", "boundary", "n_t"),
-    "retessellate",
-}
 
 
 def test_json_of_a_run(run, inputs):
@@ -140,7 +135,6 @@ def test_json_of_a_run(run, inputs):
     assert numbers["image"] == "sphere.nii.gz"
     assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
     options = numbers["options"]
-    assert set(options) == OPTIONS_OF_A_RUN
     assert (options["method"], options["n_t"], options["retessellate"]) == ("paper", 1, "first")
     assert (options["nodes"], options["lattice"], options["boundary"]) == (150, "bcc", "slide")
     assert (options["k_D"], options["iterations"]) == (0.3, 3)
@@ -220,15 +214,6 @@ def test_other_options(tmp_path, inputs, options):
         assert str(stated[key]) in (value, f"{value}.0")
 
 
-def test_a_slice_in_2d(tmp_path, inputs):
-    out = tmp_path / "a.vtu"
-    command = ["mesh", inputs / "sphere.nii.gz", "-o", out, "--nodes", "60", "--iterations", "1"]
-    assert exit_code(*command, "--slice", "k=8") == 0
-    file = load_mesh(out)
-    assert file.mesh.ndim == 2
-    assert_covers(file.mesh, load_image(inputs / "sphere.nii.gz", slice_=(2, 8)))
-
-
 @pytest.mark.parametrize(
     ("name", "size"), [("sphere.nii.gz", ["--nodes", "100", "--uniform"]), ("disc.nii", ["--spacing", "9"])]
 )
@@ -240,21 +225,11 @@ def test_no_iterations_write_the_lattice_itself(tmp_path, inputs, name, size):
     np.testing.assert_array_equal(mesh.cells, expected.cells)
 
 
-def test_an_output_is_replaced_with_force(tmp_path, inputs):
-    out, numbers = tmp_path / "a.vtu", tmp_path / "a.json"
-    out.write_text("old")
-    numbers.write_text("old")
-    command = ["mesh", inputs / "disc.nii", "-o", out, "--json", numbers, "--nodes", "30"]
-    assert exit_code(*command, "--iterations", "1", "--force") == 0
-    assert numbers_in(numbers)["mesh_sha256"] == mesh_hash(load_mesh(out).mesh)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.vtu"]
-
-
-def test_the_table_shows_before_and_after(tmp_path, inputs, capsys):
+def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, inputs, capsys):
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert exit_code(*command, "--nodes", "150", "--iterations", "2") == 0
-    numbers = numbers_in(tmp_path / "a.json")
-    lines = capsys.readouterr().out.splitlines()
+    assert exit_code(*command, "--nodes", "150", "--iterations", "3") == 0
+    numbers, said = numbers_in(tmp_path / "a.json"), capsys.readouterr()
+    lines = said.out.splitlines()
     table = {row[0]: row[1:] for row in (re.split(r"\s{2,}", line.strip()) for line in lines) if len(row) == 3}
     first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["octree", "optimised"]
@@ -269,13 +244,7 @@ def test_the_table_shows_before_and_after(tmp_path, inputs, capsys):
         f"{tmp_path / 'a.vtu'}: {nodes} nodes, {cells} cells",
         f"{tmp_path / 'a.json'}: every number of the run",
     ]
-
-
-def test_progress_in_lines(tmp_path, inputs, capsys):
-    command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert exit_code(*command, "--nodes", "150", "--iterations", "3") == 0
-    history = numbers_in(tmp_path / "a.json")["history"]
-    lines = capsys.readouterr().err.splitlines()
+    history, lines = numbers["history"], said.err.splitlines()
     words = "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
     first = f"{inputs / 'sphere.nii.gz'}: {words}"
     assert lines[0] == first
@@ -377,6 +346,7 @@ def child(arguments, **options):
     )  # fmt: skip
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
 def test_ctrl_c_leaves_a_valid_mesh(tmp_path, inputs):
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
@@ -401,6 +371,7 @@ def test_ctrl_c_leaves_a_valid_mesh(tmp_path, inputs):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.vtu"]
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
 def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     def impatient(*_, stop, **__):
@@ -421,6 +392,7 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.deep
 def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -435,38 +407,25 @@ def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
 
 
 BAD_OPTIONS = [
-    ("--nodes 100 --spacing 5", "--nodes and --spacing: give one of them"),
     ("--nodes 6", "9 or more in 3-D, got 6"),
     ("--uniform --nodes 6", "nodes must lie between 9 and"),
     ("--nodes 99999999999", "nodes must lie between 9 and"),
     ("--nodes -5", "--nodes: expected a whole number, 5 or more, got -5"),
-    ("--nodes 2.5", "--nodes"),
     ("--spacing 0", "--spacing: expected a length above 0 mm"),
-    ("--spacing nan", "--spacing: expected a length above 0 mm"),
     ("--k-d 1", "--k-d: expected 0 <= k_D < 1, got 1.0"),
-    ("--k-d -0.1", "--k-d: expected 0 <= k_D < 1, got -0.1"),
-    ("--k-d nan", "--k-d: expected 0 <= k_D < 1, got nan"),
     ("--k-d abc", "--k-d"),
     ("--iterations -1", "--iterations"),
-    ("--iterations 1.5", "--iterations"),
-    ("--n-t -1", "--n-t"),
-    ("--threads 0", "--threads: expected 1 to"),
     ("--threads 10000", "--threads: expected 1 to .* got 10000"),
     ("--max-seconds 0", "--max-seconds: expected more than 0"),
-    ("--max-seconds nan", "--max-seconds: expected more than 0"),
     ("--lattice criss-cross", "expected one of bcc, five-tet in 3-D"),
-    ("--lattice fcc", "--lattice"),
     ("--method fast --n-t 2", "--n-t: only with --method paper"),
     ("--method paper --shape-power 3", "--shape-power: only with --method fast"),
     ("--min-dihedral 80", "--min-dihedral: expected 0 to below 70"),
     ("--shape-power 0.5", "--shape-power: expected 1"),
-    ("--boundary free", "--boundary"),
     ("--retessellate always", "--retessellate"),
     ("--slice z", 'slice: expected .* got "z"'),
     ("--slice k=99", "slice: index along axis 2 must be from 0 to 15, got 99"),
     ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
-    ("--crop 3:3,:,:", "crop"),
-    ("--crop 0:5,:", "crop"),
     ("--crop 0:99,:,:", "crop"),
     ("--volume 1", "volume 1 asked for"),
     ("--json no/such/run.json", "folder does not exist"),
@@ -491,7 +450,6 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc} -o a.vtu --slice k=3", "slice"),
         ("mesh {disc} -o a.vtu --crop 1:5,1:5,1:5", "crop"),
         ("mesh {disc} -o a.obj", "unknown suffix; known are .vtu"),
-        ("mesh {disc} -o no/a.vtu", "folder does not exist"),
         ("mesh {disc}", "--output"),
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
@@ -499,21 +457,16 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
-        ("quality {lattice} --json no/a.json", "folder does not exist"),
         ("quality", "Missing argument 'MESH'"),
         ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; give one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),
         ("phantom sphere -o a.png", "ends in .nii or .nii.gz"),
-        ("phantom sphere -o a.nii --labels b.png", "ends in .nii or .nii.gz"),
         ("phantom sphere -o a.nii --labels ./a.nii", "or another output"),
         ("phantom sphere -o a.nii --voxel-mm 0", "--voxel-mm: "),
-        ("phantom sphere -o a.nii --voxel-mm 1e-9", "--voxel-mm: "),
         ("phantom sphere -o a.nii --noise-sd -1", "--noise-sd: "),
         ("phantom sphere -o a.nii --seed x", "--seed"),
         ("refine", "No such command 'refine'"),
-        ("--unknown", "No such option: --unknown"),
         ("demo -o {disc}", "expected a folder"),
-        ("demo --iterations -1", "--iterations"),
     ],
 )
 def test_bad_inputs(tmp_path, inputs, monkeypatch, capfd, arguments, match):
@@ -525,28 +478,15 @@ def test_bad_inputs(tmp_path, inputs, monkeypatch, capfd, arguments, match):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["a.vtu", "a.json"])
-def test_existing_outputs_are_refused_before_the_work(tmp_path, inputs, monkeypatch, capfd, name):
-    monkeypatch.setattr(tetopt.job.inputs, "load_image", None)  # a call would fail
-    (tmp_path / name).write_text("old")
-    command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert_refused(capfd, command, f"{name}: exists already; pass --force")
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "old")]
-
-
-def test_existing_outputs_of_the_other_commands(tmp_path, inputs, capfd):
+def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
     for name in ("a.nii", "b.nii", "a.json"):
         (tmp_path / name).write_text("old")
-    new = tmp_path / "new.nii"
+    new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
+    assert_refused(capfd, mesh, "a.json: exists already; pass --force")
     assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
     assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
     assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(("a.nii", "b.nii", "a.json"), "old")
-
-
-def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, capfd):
-    (tmp_path / "a.vtu").write_text("no mesh at all")
-    assert_refused(capfd, ["quality", tmp_path / "a.vtu"], "a.vtu: damaged")
 
 
 def test_the_systems_errors_take_one_line(tmp_path, inputs, monkeypatch, capfd):
@@ -581,26 +521,6 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
 # Help and version
 
 
-OPTIONS = {
-    "mesh": "-o --output --nodes --spacing --lattice --k-d --iterations --n-t --retessellate --method --boundary "
-    "--threads --max-seconds --volume --crop --slice --json --force",
-    "quality": "--image --volume --json --force",
-    "phantom": "-o --output --voxel-mm --blur-mm --noise-sd --seed --labels --force",
-    "demo": "-o --output --nodes --iterations --force",
-}
-
-
-@pytest.mark.parametrize("command", OPTIONS)
-@pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_help_lists_the_options(monkeypatch, capsys, command, flag):
-    monkeypatch.setenv("COLUMNS", "200")
-    assert exit_code(command, flag) == 0
-    captured = capsys.readouterr()
-    words = set(re.findall(r"(?<!\w)--?[a-z-]+", captured.out))
-    assert words >= {*OPTIONS[command].split(), "--help", "-h"}
-    assert captured.err == ""
-
-
 @pytest.mark.parametrize("width", ["80", "120"])
 def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys, width):
     monkeypatch.setenv("COLUMNS", width)
@@ -629,21 +549,23 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
 def test_help_lists_the_commands(capsys):
     assert exit_code("--help") == 0
     captured = capsys.readouterr()
-    assert all(re.search(rf"\b{command}\b", captured.out) for command in OPTIONS)
+    assert all(re.search(rf"\b{command}\b", captured.out) for command in COMMANDS)
     assert exit_code() == 2
     bare = capsys.readouterr()
     assert (bare.out + bare.err).strip() == captured.out.strip()  # the help, and no line of complaint
 
 
-def test_version(capsys):
+def test_version_also_as_a_module(capsys):
     assert exit_code("--version") == 0
     assert capsys.readouterr() == (f"tetopt {tetopt.__version__}\n", "")
+    assert child(["--version"]).communicate(timeout=60) == (f"tetopt {tetopt.__version__}\n", "")
 
 
 # Libraries that take time to load; the order is that of the printed line.
 HEAVY = "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage scipy.sparse scipy.spatial vtkmodules"
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(
     ("code", "needed"),
     [
@@ -663,7 +585,7 @@ def test_nothing_is_loaded_before_it_is_used(code, needed):
     assert done.stdout.splitlines()[-1].split()[1:] == sorted(needed.split(), key=HEAVY.split().index)
 
 
-@pytest.mark.parametrize("threads", ["0", "-1", "abc", "1.5", "1000000", "9" * 5000])
+@pytest.mark.parametrize("threads", ["0", "1.5", "9" * 5000])
 def test_threads_that_cannot_be_are_refused(inputs, tmp_path, monkeypatch, capfd, threads):
     """numba ends with a traceback, or takes another number."""
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
@@ -681,12 +603,6 @@ def test_every_public_name_is_there():
         assert getattr(tetopt, name) is not None
     with pytest.raises(AttributeError, match="octre"):
         tetopt.octre  # noqa: B018
-
-
-def test_as_a_module():
-    process = child(["--version"])
-    assert process.communicate(timeout=60) == (f"tetopt {tetopt.__version__}\n", "")
-    assert process.returncode == 0
 
 
 # --------------------------------------------------------------------------------------------------
@@ -712,18 +628,6 @@ def test_quality_of_a_run(run, inputs, tmp_path, capsys):
     assert re.search(rf"^nodes +{len(file.mesh.points)}$", captured.out, re.M)
 
 
-def test_quality_tells_of_inverted_cells(run, tmp_path, capsys):
-    _, numbers, file, _ = run
-    cells = file.mesh.cells.copy()
-    cells[:3, :2] = cells[:3, 1::-1]
-    meshio.write(tmp_path / "a.vtu", meshio.Mesh(file.mesh.points, [("tetra", cells)]))
-    assert exit_code("quality", tmp_path / "a.vtu", "--json", tmp_path / "q.json") == 0
-    report = numbers_in(tmp_path / "q.json")
-    assert report["n_turned"] == 3
-    assert report["quality"]["errors"]["mean"] == pytest.approx(numbers["quality"]["errors"]["mean"], rel=1e-12)
-    assert "3 cells were inverted in the file and have been turned" in capsys.readouterr().err
-
-
 def test_quality_of_a_mesh_elsewhere(run, inputs, tmp_path, capfd):
     _, _, file, _ = run
     save_mesh(tmp_path / "far.vtu", Mesh(file.mesh.points + 1000.0, file.mesh.cells))
@@ -742,7 +646,7 @@ def test_quality_of_triangles(inputs, tmp_path, capsys):
 # phantom
 
 
-@pytest.mark.parametrize("name", phantom_names())
+@pytest.mark.parametrize("name", ["disc_2d", "two_spheres"])
 def test_phantoms_with_labels(tmp_path, name, capsys):
     phantom = load_phantom(name)
     voxel = float(phantom.size_mm.max() / 16)
@@ -760,15 +664,6 @@ def test_phantoms_with_labels(tmp_path, name, capsys):
     assert captured.out.startswith(f"{image_path}: {name}, {size} voxels, ")
     assert captured.err == ""
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.nii.gz", "labels.nii.gz"]
-
-
-def test_a_phantom_of_ones_own(tmp_path):
-    (tmp_path / "mine.toml").write_text(OBLIQUE_TOML)
-    command = ["phantom", tmp_path / "mine.toml", "-o", tmp_path / "a.nii"]
-    assert exit_code(*command, "--noise-sd", "2", "--seed", "7", "--blur-mm", "1.5") == 0
-    expected = load_phantom(tmp_path / "mine.toml").image(noise_sd=2.0, seed=7, blur_mm=1.5)
-    np.testing.assert_array_equal(load_image(tmp_path / "a.nii").data, expected.data)
-    np.testing.assert_allclose(load_image(tmp_path / "a.nii").affine, expected.affine, rtol=1e-6)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -814,12 +709,6 @@ def test_an_oblique_anisotropic_volume(tmp_path, data_dir):
     assert image.spacing.max() / image.spacing.min() > 2.0  # and anisotropic
     assert_covers(mesh, image)
     assert_round_trips(mesh.points, image)
-    # The corners once more, by nibabel's affine and nothing of ours.
-    file = nibabel.load(path)
-    index = np.array(list(product(*[(-0.5, s - 0.5) for s in file.shape[:3]])))
-    corners = nibabel.affines.apply_affine(file.affine, index)
-    np.testing.assert_allclose(mesh.points.min(axis=0), corners.min(axis=0), atol=1e-6)
-    np.testing.assert_allclose(mesh.points.max(axis=0), corners.max(axis=0), atol=1e-6)
 
 
 def test_a_4d_file_needs_a_volume(tmp_path, data_dir, capfd):
@@ -877,6 +766,7 @@ def small_run(inputs, folder, iterations):
     return [*command, "--iterations", iterations]
 
 
+@pytest.mark.deep
 def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
     """`tetopt mesh ... | head -1`: mesh and numbers are written, and nothing complains."""
     command = [sys.executable, "-m", "tetopt", "mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu"]
@@ -929,12 +819,6 @@ def test_quality_of_a_part(tmp_path, inputs, part, capsys):
     assert inside == all_
 
 
-def test_figures(tmp_path, inputs):
-    command = small_run(inputs, tmp_path, 1)
-    assert exit_code(*command, "--figures", tmp_path) == 0
-    assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
-
-
 def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_is_refused(tmp_path, inputs, capfd):
     mesh = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--iterations", "0", "--spacing", "16"]
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "new" / "deep", "--mask", tmp_path / "no.nii"], "no.nii")
@@ -944,16 +828,8 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: the folder for the results cannot be made")
     assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
-    assert "slice.png" in {each.name for each in (tmp_path / "new" / "deep").iterdir()}
-
-
-def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
-    save_image(tmp_path / "few.nii", Image(np.arange(27.0).reshape(3, 3, 3)))
-    assert exit_code("mesh", tmp_path / "few.nii", "-o", tmp_path / "a.vtu", "--nodes", "500", "--uniform") == 0
-    words = re.search(r"(\d+) of (\d+) cells hold no voxel centre", capsys.readouterr().err)
-    empty, n_cells = map(int, words.groups())
-    mesh = tetopt.load_mesh(tmp_path / "a.vtu")
-    assert (empty, n_cells) == ((mesh.cell_data["n_voxels"] == 0).sum(), len(mesh.mesh.cells))
+    names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
+    assert {each.name for each in (tmp_path / "new" / "deep").iterdir()} == names
 
 
 @pytest.mark.parametrize(
@@ -961,20 +837,13 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
     [
         (["--method", "paper"], "only with --method fast"),
         (["--spacing", "3"], "no one spacing"),
-        (["--uniform"], "--uniform and --lattice octree: give one of them"),
-        (["--nodes", "7"], "9 or more in 3-D, got 7"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
-        (["--nodes", "500", "--target-error", "0.1"], "--nodes and --target-error: give one of them"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
-        (["--nodes", "100", "--edge-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--edge-size", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
-        (["--edge-max", "0"], "--edge-max: expected a length above 0"),
         (["--size-min", "9", "--edge-max", "8"], "--edge-max: 8 mm is below the smallest size, 9 mm"),
         (["--edge-size", "-1"], "--edge-size: expected a length above 0"),
-        (["--size-min", "9", "--edge-size", "8"], "--edge-size: 8 mm is below the smallest size, 9 mm"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
-        (["--sizing", "missing.nii"], "missing.nii"),
     ],
 )
 def test_octree_options(tmp_path, inputs, capsys, extra, words):
@@ -997,16 +866,15 @@ def test_octree_mesh(tmp_path, inputs, capsys):
     loaded = tetopt.load_mesh(path)
     assert len(loaded.mesh.points) == 400
     assert exit_code(*words, "--force", "--k-d", "0", "--iterations", "1") == 0
-    err = capsys.readouterr().err
-    violated = len(tetopt.load_mesh(path).mesh.points)
-    assert (f"{violated} nodes instead of 400" in err) == (abs(violated - 400) > 4)
+    n_nodes, err = len(tetopt.load_mesh(path).mesh.points), capsys.readouterr().err
+    assert (f"{n_nodes} nodes instead of 400" in err) == (abs(n_nodes - 400) > 4)
 
 
-@pytest.mark.parametrize("word", ["--uniform", "--spacing 8", "--lattice five-tet", "--method paper"])
-@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--edge-size 9", "--edge-max 9"])
+@pytest.mark.parametrize(
+    ("word", "option"),
+    [("--uniform", "--target-error 0.1"), ("--spacing 8", "--edge-size 9"), ("--method paper", "--edge-max 9")],
+)
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
-    if word == "--spacing 8" and option.startswith("--target"):
-        option = "--edge-size 9"
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
     assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
 
@@ -1070,16 +938,6 @@ def test_target_error(tmp_path, inputs, capfd):
     assert "left in the cells, more than 0.01" in capfd.readouterr().err
 
 
-def test_the_default_is_graded(tmp_path, inputs, capfd):
-    """And as many nodes as a small image is worth; --uniform is the lattice."""
-    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--iterations", "1"]
-    assert exit_code(*command) == 0
-    assert "octree of" in capfd.readouterr().err
-    assert abs(len(load_mesh(tmp_path / "a.vtu").mesh.points) - 512) <= 40
-    assert exit_code(*command, "--uniform", "--nodes", "100", "--force") == 0
-    assert "lattice of" in capfd.readouterr().err
-
-
 # --------------------------------------------------------------------------------------------------
 # segment
 
@@ -1133,15 +991,7 @@ def test_segment_labels_must_lie_where_the_image_does(tmp_path, inputs, capfd):
     assert "labels must be whole numbers" in capfd.readouterr().err
     mesh = ["mesh", inputs / "sphere.nii.gz", "--slice", "k=5", "-o", tmp_path / "s.vtu", "--nodes", "40"]
     assert exit_code(*mesh, "--iterations", "0") == 0
-    cut = [
-        "segment",
-        inputs / "sphere.nii.gz",
-        tmp_path / "s.vtu",
-        "-o",
-        tmp_path / "l.nii",
-        "--slice",
-        "k=5",
-    ]
+    cut = ["segment", inputs / "sphere.nii.gz", tmp_path / "s.vtu", "-o", tmp_path / "l.nii", "--slice", "k=5"]
     assert exit_code(*cut, "--truth", tmp_path / "truth.nii", "--classes", "2") == 0
     kept = (tmp_path / "truth.nii").read_bytes()
     over = [*cut[:4], tmp_path / "truth.nii", *cut[5:], "--truth", tmp_path / "truth.nii", "--force"]

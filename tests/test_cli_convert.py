@@ -21,6 +21,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.model.averages import cell_young
 from tetopt.model.loads import parse_load
 
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 MAPPING = "1 + h/7"
 
 
@@ -66,14 +67,6 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     assert exit_code("convert", folder / "a.vtu", out) == 2  # is there already
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_mesh_writes_every_format(folder, tmp_path, suffix):
-    out = tmp_path / f"out{suffix}"
-    more = [] if FORMATS[suffix].is_surface else ["--young", "2.5"]
-    assert exit_code("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
-    assert out.stat().st_size > 900
-
-
 @pytest.fixture(scope="module")
 def quadratic_path(folder):
     """The same mesh of order 2, with a displacement of every node."""
@@ -91,7 +84,8 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
     mesh = tetopt.load_mesh(folder / "a.vtu").mesh
     n_corners, n_all = len(mesh.points), len(quadratic(mesh.points, mesh.cells)[0])
     capsys.readouterr()
-    for suffix, form in FORMATS.items():
+    for suffix in (".vtu", ".msh", ".inp", ".stl"):
+        form = FORMATS[suffix]
         out, numbers = tmp_path / f"kept{suffix}", tmp_path / f"kept{suffix}.json"
         assert exit_code("convert", quadratic_path, out, "--json", numbers) == 0
         order = 2 if form.has_quadratic else 1
@@ -103,7 +97,7 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
         if order == 2:
             assert f"{n_corners} corner nodes, {n_all} in all, {len(mesh.cells)} cells" in said
         assert "has no quadratic cells" not in said
-    for name in ("kept.vtu", "kept.vtk", "kept.vtkhdf", "kept.msh"):
+    for name in ("kept.vtu", "kept.msh"):
         loaded = tetopt.load_mesh(tmp_path / name)
         assert loaded.order == 2
         points = quadratic(loaded.mesh.points, loaded.mesh.cells)[0]
@@ -119,7 +113,7 @@ def test_forces_that_hold_sets_go_on_with_the_results_in_their_own_axes_and_unit
     for name in ("reactions", "reactions_step2", "reactions of mine"):
         grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
     grid.save(tmp_path / "a.vtu")
-    for options, is_kept in (([], True), (["--space", "lps"], False), (["--units", "MPa"], False)):
+    for options, is_kept in (([], True), (["--units", "MPa"], False)):
         assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force", *options) == 0
         loaded = tetopt.load_mesh(tmp_path / "b.vtu")
         for name in ("reactions", "reactions_step2"):
@@ -230,10 +224,9 @@ def test_results_of_other_moduli_or_loads_are_left_out(folder, tmp_path, capsys)
     assert exit_code("fem", first, "-o", solved) == 0
     fields = {"displacement", "von_mises", "stress_nodes"}
     said = "left out, as they are of other moduli or loads: strain, stress, von_mises, displacement,"
-    for options in ([], ["--young", "3"], ["--nu", "0.3"], ["--load", "compress:4%"], ["--bins", "2"]):
-        more = ["--young", "2", *options] if "--nu" in options else options
+    for options in ([], ["--young", "3"], ["--load", "compress:4%"]):
         capsys.readouterr()
-        assert exit_code("convert", solved, tmp_path / "b.vtu", "--force", *more) == 0
+        assert exit_code("convert", solved, tmp_path / "b.vtu", "--force", *options) == 0
         assert (said in capsys.readouterr().err) == bool(options)
         loaded = tetopt.load_mesh(tmp_path / "b.vtu")
         kept = fields & {*loaded.cell_data, *loaded.point_data}
@@ -255,36 +248,26 @@ def test_the_error_of_bins_goes_on(folder, tmp_path, capsys):
     assert "modulus off by" not in capsys.readouterr().out
 
 
-def test_what_msh_files_do_not_bring_back_is_said(folder, tmp_path, capsys):
+def test_what_formats_do_not_hold_as_it_is_is_said(folder, tmp_path, capsys):
+    """Loads that no reader of gmsh's brings back, label 0, groups that are not complete, numbers of no label."""
     (tmp_path / "names.csv").write_text("label,name\n1,liver\n")
     more = ["--young", "2", "--load", "compress:5%", "--label-names", tmp_path / "names.csv"]
-    for suffix, is_said in ((".msh", True), (".msh2", True), (".vtu", False), (".inp", False)):
-        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *more) == 0
-        said = capsys.readouterr().out
-        assert (f"loads are not read back from {suffix}" in said) == is_said
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "b.msh") == 0
-    assert "are not read back" not in capsys.readouterr().out
-
-
-def test_the_group_of_label_0_and_incomplete_groups_are_said(folder, tmp_path, capsys):
-    labels = tetopt.load_mesh(folder / "a.vtu").cell_data["label"].astype(int)
-    assert labels.min() == 0
-    for suffix in (".msh", ".msh2"):
+    last = int(tetopt.load_mesh(folder / "a.vtu").cell_data["label"].max())
+    group, short = f"label 0 is physical group {last + 1}", "those of smaller sets are missing from boundary"
+    for suffix, expected in {
+        ".msh": [group], ".msh2": [group, short], ".mfem": [f"label 0 is attribute {last + 1}"],
+        ".mesh": [f"label 0 is reference {last + 1}"], ".vtu": [],
+    }.items():  # fmt: skip
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}") == 0
-        said = capsys.readouterr().out
-        assert f"label 0 is physical group {labels.max() + 1}, as gmsh has no group 0" in said
-        assert ("those of smaller sets are missing from boundary" in said) == (suffix == ".msh2")
-
-
-def test_numbers_that_are_not_a_label_s_are_said(folder, tmp_path, capsys):
-    labels = tetopt.load_mesh(folder / "a.vtu").cell_data["label"].astype(int)
-    for suffix, word in ((".mfem", "attribute"), (".mesh", "reference")):
-        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}") == 0
-        said = capsys.readouterr().out
-        assert f"label 0 is {word} {labels.max() + 1}" in said
-        assert "2001" not in said
-        assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", "--young", MAPPING) == 0
-        assert "number from 2001 on (label_1, label_0)" in " ".join(capsys.readouterr().out.split())
+        plain = capsys.readouterr().out
+        assert all((words in plain) == (words in expected) for words in (*expected, group, short))
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", *more) == 0
+        assert (f"loads are not read back from {suffix}" in capsys.readouterr().out) == (".msh" in suffix)
+        assert "not read back" not in plain
+        assert "2001" not in plain
+        if suffix in (".mfem", ".mesh"):
+            assert exit_code("convert", folder / "a.vtu", tmp_path / f"c{suffix}", "--young", MAPPING) == 0
+            assert "number from 2001 on (label_1, label_0)" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
@@ -294,7 +277,6 @@ def test_numbers_that_are_not_a_label_s_are_said(folder, tmp_path, capsys):
         (["--young", "0.003"], "young is up to 0.003 kPa, softer than any tissue"),
         (["--young", "3", "--density", "1.06"], "density is up to 1.06 kg/m3, where water's is 1000"),
         (["--young", "3", "--density", "1060", "--load", "gravity:0,0,-9.81"], "gravity is 9.81 mm/s2"),
-        (["--young", "1=1e7,0=0.5"], None),
         (["--young", "0=17e6,1=1e5", "--density", "1=1000,0=1.2", "--load", "gravity:0,0,-9810"], None),
     ],
 )
@@ -371,8 +353,6 @@ def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
     [
         (["--nodes", "100"], "--start and --nodes"),
         (["--mask", "l.nii.gz"], "--start and --mask"),
-        (["--uniform"], "--start and --uniform"),
-        (["--lattice", "bcc"], "--start and --lattice"),
         (["--edge-size", "3"], "--edge-size: only on a graded mesh"),
         (["--method", "paper"], "only with --method fast"),
     ],
@@ -476,9 +456,7 @@ def test_large_deformation_and_means_over_cells_are_said(folder, tmp_path, capsy
     assert "one modulus a cell: the mean" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "text", ['[["left", null]]', '[["left", [[1,2,3]]]]', "[" * 100_000, "{}", "3", '[["gone", [0,0,1]]]']
-)
+@pytest.mark.parametrize("text", ['[["left", null]]', "[" * 100_000, "3"])
 def test_loads_of_another_kind_in_a_file_are_left(folder, tmp_path, text):
     grid = pyvista.read(folder / "a.vtu")
     grid.field_data["loads"] = np.frombuffer(text.encode(), dtype=np.uint8)
@@ -488,13 +466,11 @@ def test_loads_of_another_kind_in_a_file_are_left(folder, tmp_path, text):
 
 
 def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
-    for suffix in FORMATS:
-        if FORMATS[suffix].is_surface:
-            continue
+    for suffix in (".inp", ".feb", ".xdmf"):
         options = ["--young", "3", "--load", "compress:5%"]
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *options) == 0
         is_said = "the format runs no step" in capsys.readouterr().out
-        assert is_said == (suffix not in (".inp", ".feb")), suffix
+        assert is_said == (suffix == ".xdmf"), suffix
 
 
 def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them(folder, tmp_path, capsys):
@@ -513,9 +489,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
     ("out", "more", "match"),
     [
         ("a.foo", [], "unknown suffix; known are .vtu (VTK, ParaView), .vtk"),
-        ("a", [], "unknown suffix"),
         ("a.inp", ["--young", "1 + x"], 'cannot use "x"'),
-        ("a.inp", ["--young", "__import__('os')"], "cannot use"),
         ("a.inp", ["--young", "0:1,100:5,50:3"], "--young: intensities must increase, got 100 and then 50"),
         ("a.inp", ["--young", "2", "--nu", "0:x"], "--nu: expected pairs intensity:value"),
         (
@@ -523,47 +497,28 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
             ["--young", "h+1", "--average", "gauss"],
             "--average: gauss is over an image's voxels; give the image",
         ),
-        ("a.inp", ["--young", "no.toml"], "no such file"),
         ("a.inp", ["--young", "0"], "young: expected moduli above 0 kPa"),
-        ("a.inp", ["--young", "-h"], "expected 0 kPa or more"),
         ("a.inp", ["--young", "2", "--nu", "0.5"], "-1 < nu < 0.5"),
-        ("a.inp", ["--young", "2", "--nu", "-1"], "-1 < nu < 0.5"),
-        ("a.inp", ["--young", "2", "--nu", "x"], 'cannot use "x"'),
         ("a.inp", ["--nu", "0.3"], "--nu: there is no --young"),
         ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: there is no --image"),
         ("a.inp", ["--young", "2", "--load", "gravity:0,0,-9810"], "gravity: the cells have no density"),
         ("a.vtu", ["--young", "2", "--nonlinear"], "--nonlinear is for .inp, .feb only"),
-        (
-            "a.inp",
-            ["--young", "2", "--load", "1/hold:left", "--load", "2/hold:left", "--nonlinear"],
-            "one nonlinear step",
-        ),
         ("a.inp", ["--young", "2", "--load", "pressure:nowhere:1"], 'no set of facets "nowhere"'),
-        ("a.inp", ["--young", "2", "--load", "spring:left:-1"], "stiffness above 0"),
         ("a.inp", ["--young", "2", "--load", "pressure:interface_0_1:1"], "lie between two cells"),
-        ("a.inp", ["--density", "1000"], "--density: there is no --young"),
-        ("a.inp", ["--young", "2", "--density", "-h"], "expected kg/m3 above 0"),
-        ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--average", "mean"], "--average: there is no --young"),
         ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
-        ("a.inp", ["--young", "h+1", "--average", "hill"], "--average: hill is over an image's voxels; give the image"),
-        ("a.inp", ["--young", "2", "--average", "hill"], "--average: hill is over an image's voxels; give the image"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
-        ("a.inp", ["--young", "h+1", "--bins", "4:cubic"], "--bins: expected K"),
         ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
         ("a.stl", ["--order", "2"], "--order 2 is for .vtu, .vtk, "),
         ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
-        ("a.inp", ["--young", "2", "--load", "compress:5"], "expected compress:P%"),
-        ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),
         ("a.inp", ["--set", "x=above:3"], "expected NAME=below:T"),
         ("a.feb", [], "needs a material; give a modulus mapping (--young)"),
         ("a.stl", ["--young", "2"], "holds the boundary alone"),
         ("a.inp", ["--mask", "m.nii.gz"], "--mask: there is no --image"),
-        ("no/a.inp", [], "folder does not exist"),
     ],
 )
 def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys):
@@ -574,13 +529,12 @@ def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", [".inp", ".vtu", ".stl"])
-def test_a_mesh_whose_cells_are_there_several_times_is_no_solver_s(folder, tmp_path, suffix, capsys):
+def test_a_mesh_whose_cells_are_there_several_times_is_no_solver_s(folder, tmp_path, capsys):
     mesh = tetopt.load_mesh(folder / "a.vtu").mesh
     tetopt.save_mesh(tmp_path / "thrice.vtu", tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[[5, 5]]])))
-    assert exit_code("convert", tmp_path / "thrice.vtu", tmp_path / f"out{suffix}") == 2
+    assert exit_code("convert", tmp_path / "thrice.vtu", tmp_path / "out.inp") == 2
     assert re.search(r"thrice\.vtu: \d+ facets have cells that overlap", capsys.readouterr().err)
-    assert not (tmp_path / f"out{suffix}").exists()
+    assert not (tmp_path / "out.inp").exists()
 
 
 def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, capsys):
@@ -614,13 +568,6 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_mesh_s_file_is_not_replaced_by_itself(folder, capsys):
-    before = (folder / "a.vtu").read_bytes()
-    assert exit_code("convert", folder / "a.vtu", folder / "a.vtu", "--force") == 2
-    assert "is an input of this command too" in capsys.readouterr().err
-    assert (folder / "a.vtu").read_bytes() == before
-
-
 # Surfaces
 
 
@@ -651,18 +598,14 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     ("more", "match"),
     [
         ([], "one of --below, --label, --set, --boundary, --interface"),
-        (["--below", "3", "--label", "1"], "one of --below, --label, --set, --boundary, --interface"),
         (["--below", "-3"], "no cell has a mean below -3"),
         (["--label", "7"], "no cell has label 7; there are 0, 1"),
         (["--set", "skin"], 'no set of cells "skin"; it has label_0, label_1'),
         (["--label", "1", "--space", "x"], "expected ras or lps"),
-        (["--interface", "0,1", "--boundary"], "give one of --below"),
         (["--interfaces"], "STL cannot tell which labels a triangle lies between; take .ply or .vtp or .vtk"),
         (["--interface", "0"], 'two labels as J,K, by number or name, got "0"'),
-        (["--interface", "0,1,2"], "two labels as J,K"),
         (["--interface", "1,1"], 'two different labels, got "1,1"'),
         (["--interface", "0,7"], "no facet lies between labels 0 and 7"),
-        (["--interface", "0,liver"], "no label has a name"),
     ],
 )
 def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
@@ -713,14 +656,6 @@ def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, cap
     assert [each.name for each in tmp_path.iterdir()] == ["a.html"]
 
 
-def test_what_is_refused_leaves_no_page(folder, tmp_path, capsys):
-    tetopt.save_image(tmp_path / "flat.nii.gz", tetopt.Image(np.zeros((4, 5))))
-    options = ["--image", tmp_path / "flat.nii.gz", "--html", tmp_path / "a.html"]
-    assert exit_code("view", folder / "a.vtu", *options) == 2
-    assert "-D" in capsys.readouterr().err
-    assert not (tmp_path / "a.html").exists()
-
-
 @pytest.mark.parametrize(("display", "answer"), [("", True), (":0", False), (":0", True)])
 def test_the_page_is_opened_or_it_is_said_where_it_is(folder, tmp_path, monkeypatch, capsys, display, answer):
     """Never a browser of the terminal's, which would take it over."""
@@ -756,7 +691,6 @@ def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
         table.write_text(text)
         for words in (
             ["view", folder / "a.vtu", "--html", tmp_path / "a.html"],
-            ["convert", folder / "a.vtu", tmp_path / "b.vtu"],
             ["quality", folder / "a.vtu", "--image", folder / "a.nii.gz", "--labels", folder / "l.nii.gz"],
         ):
             force = [] if words[0] == "quality" else ["--force"]
@@ -769,9 +703,7 @@ def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
     [
         (["--slice", "k=99"], "a.nii.gz: --slice: index along axis 2 must be"),
         (["--nodes", "6"], "tetopt: --nodes: expected a whole number of nodes"),
-        (["--nodes=6"], "tetopt: --nodes: expected a whole number of nodes"),
         (["--load", "hold:nowhere", "--young", "2"], 'tetopt: --load: there is no set of facets "nowhere"'),
-        (["--gradation", "3"], "tetopt: --gradation: expected 0.05"),
         (["--edge-size", "-1"], "tetopt: --edge-size: expected a length above 0 mm"),
     ],
 )

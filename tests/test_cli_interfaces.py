@@ -9,6 +9,8 @@ from commands import exit_code, numbers_in
 import tetopt
 from tetopt.measure.fidelity import cell_labels
 
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+
 
 def block_mesh(labels):
     """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""

@@ -12,6 +12,8 @@ from results import FOLDER, our_displacement, solved_model
 import tetopt
 from tetopt.io.abaqus import input_sets
 
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+
 
 @pytest.fixture(params=[1, 2])
 def order(request):
@@ -79,12 +81,7 @@ def test_refusals_write_nothing(folder, capsys):
         assert words in re.sub(r"\s+", " ", said)
         assert {path.name for path in folder.iterdir()} == before
 
-    refused(
-        "--results: expected OUT named .vtu or .vtk or .vtkhdf, got",
-        folder / "b.inp",
-        "--results",
-        folder / "a.frd",
-    )
+    refused("--results: expected OUT named .vtu or .vtk", folder / "b.inp", "--results", folder / "a.frd")
     refused("no such file", folder / "b.vtu", "--results", folder / "c.frd")
     refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
@@ -107,8 +104,7 @@ def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(folder, order, c
     assert set(sets.cells) == {"soft"}
 
 
-@pytest.mark.parametrize("nu", [0.45, 0.44])
-@pytest.mark.parametrize("suffix", [".inp", ".feb", ".xdmf", ".vtu"])
+@pytest.mark.parametrize(("suffix", "nu"), [(".inp", 0.45), (".inp", 0.44), (".xdmf", 0.45), (".vtu", 0.45)])
 def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(tmp_path, suffix, nu, capsys):
     mesh = solved_model(1).mesh
     tetopt.save_mesh(tmp_path / "a.vtu", mesh)

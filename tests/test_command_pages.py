@@ -9,6 +9,8 @@ import pytest
 from tetopt.cli import main
 from tetopt.cli.app import COMMANDS
 
+pytestmark = pytest.mark.full
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 sys.path.insert(0, str(DOCS / "_extensions"))
 command_pages = pytest.importorskip("command_pages")

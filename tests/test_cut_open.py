@@ -9,6 +9,8 @@ import tetopt
 from tetopt.measure.fidelity import cell_labels
 from tetopt.report.colours import label_colours
 
+pytestmark = pytest.mark.full
+
 TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
 cut_open = script("cut_open")
 
@@ -69,15 +71,6 @@ def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
         assert grey_value == means[owner]
     assert [axes.get_title() for axes in figure.axes] == ["mean of the image in each cell", "label of each cell"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1", "2"]
-
-
-def test_a_cutaway_without_labels_shows_all_cells(monkeypatch, tmp_path):
-    labels = halves()
-    mesh = tetopt.lattice_mesh(labels, nodes=200)
-    (grey,), figure = photographed(monkeypatch, tmp_path / "a.png", labels, mesh)
-    np.testing.assert_allclose(np.ptp(np.asarray(grey.points), axis=0), np.ptp(mesh.points, axis=0), rtol=1e-5)
-    assert len(figure.axes) == 1
-    assert figure.legends == []
 
 
 def test_a_cutaway_is_photographed_without_margins(tmp_path, opengl):

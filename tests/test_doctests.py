@@ -40,6 +40,7 @@ def methods(name):
 DOCUMENTED = [*NAMES, *(each for name in NAMES if inspect.isclass(getattr(tetopt, name)) for each in methods(name))]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", DOCUMENTED)
 def test_public_names_are_documented(name):
     """Summary, parameters in order, what comes back, an example; of functions what they refuse, too."""
@@ -64,6 +65,7 @@ def fields_of(record):
     return [name for group in names for name in group.split(", ")]
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("path", MODULES, ids=dotted)
 def test_examples_run(path, tmp_path, monkeypatch):
     """Each docstring's by itself, in a folder of its own, with numpy as np and tetopt at hand."""

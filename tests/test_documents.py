@@ -12,6 +12,8 @@ import tetopt
 from tetopt.cli import main
 from tetopt.cli.app import COMMANDS, loaded_command
 
+pytestmark = pytest.mark.deep
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts and "gallery" not in page.parts)
 LESSON = [DOCS / "start" / f"{name}.md" for name in ("install", "first_mesh", "what_came_out")]

@@ -9,6 +9,8 @@ import pytest
 
 from tetopt.system.extras import install_hint
 
+pytestmark = pytest.mark.full
+
 PYPROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = {
     name: [each for each in requirements if not each.startswith("tetopt[")]

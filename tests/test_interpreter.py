@@ -13,13 +13,14 @@ from models import sample_image
 from tetopt.io.images import save_image
 from tetopt.system.interpreter import others_environment
 
+pytestmark = pytest.mark.deep
+
 MODULES = sorted(name for name in sys.stdlib_module_names | packages_distributions().keys() if name.isidentifier())
 PLANTED = "import os\nopen({path!r}, 'a').write(__name__ + ' ')\n"
 COMMANDS = {  # and the kernels' compilers: tests/test_kernels.py
     "a file read by a compiled library": "mesh a.nrrd -o {out}/a.vtu --nodes 60 --iterations 0",
     "a pipeline": "compare a.nii -o {out}/compared --nodes 60 --pipelines mine --pipeline mine={program} --curve=",
     "workers whose tasks are processes": "cohort subjects.tsv -o {out}/cohort --nodes 60 --iterations 0 --workers 1",
-    "workers that run tasks": "mesh a.nii -o {out}/a.vtu --nodes 200 --parts 2 --iterations 1 --workers 1",
 }
 NRRD = """NRRD0004
 type: float

@@ -189,21 +189,21 @@ print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.st
 """
 
 
+def ran(folder, program, cache=None, **names):
+    """A program in a process of its own that imports from a folder, in whose `cache` kernels are kept."""
+    paths = os.pathsep.join([str(folder), *filter(None, sys.path)])
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache or folder / "cache"), "PYTHONPATH": paths} | names
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, cwd=folder)
+
+
+@pytest.mark.deep
 @linked_only
 def test_processes_share_what_is_to_be_compiled(tmp_path):
     """The first kernel that the cache lacks is compiled here, the others by two processes; a second run loads them."""
     units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(8)]
     (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units))
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
-    }
-    said = [
-        subprocess.run(
-            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
-        ).stdout.strip()
-        for _ in range(2)
-    ]
+    said = [ran(tmp_path, PROGRAM).stdout.strip() for _ in range(2)]
     assert said == ["36.0 2 [False, True, True]", "36.0 0 [True, True, True]"]
 
 
@@ -292,6 +292,7 @@ def test_a_folder_that_everybody_may_write_is_no_cache(place, monkeypatch, tmp_p
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "own" / "numba")
 
 
+@pytest.mark.deep
 def test_compilers_run_no_modules_of_the_current_folder(tmp_path, monkeypatch):
     for name in ("numpy", "json", "tempfile"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
@@ -330,16 +331,9 @@ def use(tmp_path):
     """A function that uses four kernels in a process of its own, after some statements; what that said."""
     units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(3)]
     (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units) + PLAIN)
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
-    }
 
     def used(before=""):
-        program = [sys.executable, "-c", USE.format(before=before)]
-        return subprocess.run(
-            program, env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
-        ).stdout.splitlines()
+        return ran(tmp_path, USE.format(before=before)).stdout.splitlines()
 
     used.folder = tmp_path / "cache"
     return used
@@ -363,6 +357,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.deep
 @linked_only
 def test_damaged_files_of_the_cache_are_compiled_anew(use):
     """An index or code, of a unit or of a function of numba's own: said once, mended, and the numbers are right."""
@@ -380,6 +375,7 @@ def test_damaged_files_of_the_cache_are_compiled_anew(use):
         assert use() == [LOADED]
 
 
+@pytest.mark.deep
 @linked_only
 def test_code_under_the_name_of_other_code_is_not_run(use):
     """Two processes that write an index at once may give one name to two compilations."""
@@ -389,6 +385,7 @@ def test_code_under_the_name_of_other_code_is_not_run(use):
     assert use() == ["6.0 3.0 [False, True, True]"]
 
 
+@pytest.mark.deep
 @linked_only
 def test_a_full_disk_or_no_folder_keeps_nothing(use):
     said = use("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))")
@@ -403,6 +400,7 @@ def test_a_full_disk_or_no_folder_keeps_nothing(use):
     assert "no longer be written" in said[0] or "cannot be kept" in said[0]
 
 
+@pytest.mark.deep
 @linked_only
 @pytest.mark.skipif(os.name != "posix", reason="rights of folders")
 def test_kernels_beside_the_source_are_read_where_others_are_kept(use):
@@ -432,6 +430,7 @@ UNTRUSTED = {
 }
 
 
+@pytest.mark.deep
 @linked_only
 @pytest.mark.skipif(os.name != "posix", reason="rights of files")
 def test_what_others_can_have_written_is_not_loaded(use):
@@ -460,6 +459,7 @@ def test_what_others_can_have_written_is_not_loaded(use):
     assert not executed.exists()
 
 
+@pytest.mark.deep
 @linked_only
 def test_a_cache_that_goes_while_it_is_used_is_made_again(use):
     assert use() == [COMPILED]
@@ -531,21 +531,13 @@ def main():
 """
 
 
+@pytest.mark.deep
 @compiled_only
 def test_an_index_beyond_its_array_is_caught_where_each_is_checked(tmp_path):
     """Also after kernels without checks were kept in the same cache; these are not run then."""
     (tmp_path / "beyond.py").write_text(BEYOND)
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
-    }
-    said = [
-        subprocess.run(
-            [sys.executable, "-c", "import beyond; beyond.main()"],
-            env=environment | {"NUMBA_BOUNDSCHECK": is_checked}, capture_output=True, text=True, check=True,
-        ).stdout.strip()
-        for is_checked in "011"
-    ]  # fmt: skip
+    program = "import beyond; beyond.main()"
+    said = [ran(tmp_path, program, NUMBA_BOUNDSCHECK=is_checked).stdout.strip() for is_checked in "011"]
     survived, checked = str([[False] * 4, [False] * 4]), str([[False] * 4, [True] * 4])
     assert said == [survived, checked, checked]
 
@@ -584,6 +576,7 @@ def last_doubled(x: Floats1) -> float:
 """
 
 
+@pytest.mark.deep
 @compiled_only
 def test_a_unit_that_finds_no_memory_says_so(tmp_path, monkeypatch):
     """numba would print it and go on."""
@@ -629,6 +622,7 @@ CHANGES = (
 )
 
 
+@pytest.mark.deep
 @compiled_only
 def test_kernels_hold_where_numba_has_changed(tmp_path):
     """They are plain functions of numba's then, as on request: the same numbers; one line if nobody asked for it.
@@ -638,16 +632,9 @@ def test_kernels_hold_where_numba_has_changed(tmp_path):
     (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
     beside = tmp_path / "__pycache__"
     beside.mkdir()
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path),
-        "TETOPT_PLAIN_NUMBA": "",
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
-    }
     for before, reason in CHANGES:
-        program = [sys.executable, "-c", FENCE.format(before=before)]
-        *notices, failure, numbers = subprocess.run(
-            program, env=environment, capture_output=True, text=True, check=True
-        ).stdout.splitlines()
+        said = ran(tmp_path, FENCE.format(before=before), cache=tmp_path, TETOPT_PLAIN_NUMBA="").stdout
+        *notices, failure, numbers = said.splitlines()
         assert failure == "large: 4 of 4 calls found no memory for their arrays"
         assert numbers == f"1.0 [1. 1. 1. 1.] 2.0 {before != ''}"
         for path in tmp_path.glob("*/large_unit*.nb?"):
@@ -709,16 +696,12 @@ print(failed, all(seen))
 """
 
 
+@pytest.mark.deep
 @compiled_only
 @pytest.mark.parametrize("layer", ["default", "workqueue"])  # the latter ends a process that loops in two threads
 def test_each_thread_of_python_gets_its_own_errors(tmp_path, layer):
     (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path),
-        "NUMBA_THREADING_LAYER": layer,
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
-    }
-    done = subprocess.run([sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True)
+    done = ran(tmp_path, THREADS, cache=tmp_path, NUMBA_THREADING_LAYER=layer)
     assert done.stdout == "[100, 0, 100, 0] True\n"
     assert done.stderr == ""
 

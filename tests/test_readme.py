@@ -20,6 +20,7 @@ def test_it_is_short():
     assert len([line for line in program.splitlines() if line]) <= 15
 
 
+@pytest.mark.full
 def test_program(tmp_path, monkeypatch, capsys):
     """The Python program, in an empty folder; its numbers are what the text around it promises."""
     (program,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -42,6 +43,7 @@ def test_program(tmp_path, monkeypatch, capsys):
     assert (written.cell_data["mean"] == tetopt.cell_moments(names["image"], written.mesh).mean).all()
 
 
+@pytest.mark.full
 def test_commands(tmp_path, monkeypatch):
     """The three `tetopt` commands, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [line for line in README.splitlines() if line.startswith("tetopt ") and "`" not in line]
@@ -52,24 +54,16 @@ def test_commands(tmp_path, monkeypatch):
     for line in commands:
         words = [{"5000": "200"}.get(word, word) for word in shlex.split(line)[1:]]
         assert main(words) == 0, line
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "T1.nii.gz",
-        "brain.vtu",
-        "brain.inp",
-        "run.json",
-        "pictures",
-    }
+    written = {"T1.nii.gz", "brain.vtu", "brain.inp", "run.json", "pictures"}
+    assert {path.name for path in tmp_path.iterdir()} == written
     assert {path.name for path in (tmp_path / "pictures").iterdir()} >= {"slice.png", "rho.png"}
 
 
-@pytest.mark.parametrize("target", ["demo", "test", "docs"])
-def test_make_targets(target):
-    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    assert f"make {target}" in README
-
-
-def test_paths_named_exist():
-    """Every relative link and picture of the README is there."""
+def test_paths_and_targets_named_exist():
+    """Every relative link and picture of the README is there, and what it has make do."""
+    for target in ("demo", "test", "docs"):
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        assert f"make {target}" in README
     paths = re.findall(r"\]\(([^)#:]+)\)", README)
     assert len(paths) > 10
     for path in paths:

@@ -9,6 +9,8 @@ import tetopt
 from tetopt.cli import main
 from tetopt.contents import phantom
 
+pytestmark = pytest.mark.full
+
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 

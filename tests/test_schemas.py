@@ -16,6 +16,8 @@ import tetopt
 from tetopt.cli import main
 from tetopt.system.files import save_json
 
+pytestmark = pytest.mark.full
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs" / "_extensions"))
 

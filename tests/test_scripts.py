@@ -14,6 +14,8 @@ import tetopt
 from tetopt.engine.cost import RunSize, cost_model, memory_terms, once_terms, swept_terms
 from tetopt.geometry.topology import components
 
+pytestmark = pytest.mark.deep
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = [ROOT / "scripts", ROOT / "tests" / "benchmarks", ROOT / "docs"]
 
@@ -77,18 +79,22 @@ def test_benchmark(tmp_path, capsys):
     assert all(0.0 < row["delaunay_fraction"] < 1.0 for row in rows["paper"])
 
 
-def test_fingerprints(tmp_path, capsys):
+def test_fingerprints(tmp_path, monkeypatch, capsys):
     """The same run has the same checksums; another one is named, and is exit code 1."""
-    main, first, second = script("fingerprints").main, tmp_path / "first.json", tmp_path / "second.json"
-    assert main(["-o", str(first), "--only", "oblique_paper"]) == 0
-    assert main(["-o", str(second), "--only", "oblique_paper", "--against", str(first)]) == 0
+    module, first, second = script("fingerprints"), tmp_path / "first.json", tmp_path / "second.json"
+    module.RUN_WORDS["small"] = "OBLIQUE --nodes 100 --iterations 1"
+    images = module.made_images(tmp_path)  # once for all calls
+    monkeypatch.setattr(module, "made_images", lambda _: images)
+    main = module.main
+    assert main(["-o", str(first), "--only", "small"]) == 0
+    assert main(["-o", str(second), "--only", "small", "--against", str(first)]) == 0
     assert "1 of 1 runs as in" in capsys.readouterr().out
     written = json.loads(first.read_text())
-    written["runs"]["oblique_paper"]["mesh"] = "0" * 64
+    written["runs"]["small"]["mesh"] = "0" * 64
     first.write_text(json.dumps(written))
-    assert main(["-o", str(second), "--only", "oblique_paper", "--against", str(first), "--force"]) == 1
-    assert "differs: oblique_paper: mesh\n" in capsys.readouterr().out
-    assert main(["-o", str(second), "--only", "oblique_paper"]) == 2
+    assert main(["-o", str(second), "--only", "small", "--against", str(first), "--force"]) == 1
+    assert "differs: small: mesh\n" in capsys.readouterr().out
+    assert main(["-o", str(second), "--only", "small"]) == 2
     assert "exists" in capsys.readouterr().err
 
 
@@ -96,7 +102,7 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     """Every mesh is measured; a tighter largest edge leaves more E_D and follows the displacement better."""
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     out = tmp_path / "sizes.json"
-    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--largest", "1", "inf"]
+    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "300", "--dofs", "8000", "--largest", "1", "inf"]
     assert script("choose_sizes").main(words) == 0
     rows = {row["mesh"]: row["measured"] for row in json.loads(out.read_text())["rows"]}
     assert len(rows) == 2 + 2 + 5

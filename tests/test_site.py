@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.full
+
 ROOT = Path(__file__).resolve().parents[1]
 _spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "check_site.py")
 check_site = importlib.util.module_from_spec(_spec)

@@ -9,6 +9,8 @@ import pytest
 
 from tetopt.system import kernels
 
+pytestmark = pytest.mark.deep
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -79,12 +79,10 @@ def _of_typer(parameter: inspect.Parameter) -> Parameter:
     is_needed = default is inspect.Parameter.empty
     if _is_argument(parameter):
         return Parameter("Arguments", info.metavar, info.help or "", "" if is_needed else "optional")
-    # In an annotation typer takes an option's first name for a default, and without names makes them of the function's.
-    spelled = [*([info.default] if isinstance(info.default, str) else []), *(info.param_decls or ())]
+    # In an annotation typer takes an option's first name for a default.
+    names = [*([info.default] if isinstance(info.default, str) else []), *(info.param_decls or ())]
+    spelled = [each for name in names for each in name.split("/")]
     is_switch = bool in _each(kind)
-    if not spelled:
-        name = parameter.name.replace("_", "-")
-        spelled = [f"--{name}", f"--no-{name}"] if is_switch else [f"--{name}"]
     choices = _choices(kind)
     value = "" if is_switch else f" {info.metavar or '|'.join(choices)}"
     words = _kind(kind, choices, info.min)
@@ -92,8 +90,8 @@ def _of_typer(parameter: inspect.Parameter) -> Parameter:
         words += ", required"
     elif default not in (None, "", False) and "by default" not in info.help:
         words += f"; by default {_shown(default)}"
-    names = ", ".join(f"{name}{value}" for name in spelled)
-    return Parameter(info.rich_help_panel or "Options", names, info.help, words)
+    with_values = ", ".join(f"{name}{value}" for name in spelled)
+    return Parameter(info.rich_help_panel or "Options", with_values, info.help, words)
 
 
 def _kind(kind: Any, choices: list[str], low: float | None) -> str:

@@ -155,6 +155,7 @@ def test_runs_show_a_bar_in_a_notebook_alone(monkeypatch, capsys, ball):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.full
 def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     mesh = sample_model(3).mesh
     whole, opened = (mesh.plot(cut=cut, off_screen=True) for cut in (False, True))

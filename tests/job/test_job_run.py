@@ -11,6 +11,8 @@ import tetopt
 from tetopt.io.formats import FORMATS
 from tetopt.job.events import listened, note
 
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
 OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
 
@@ -55,17 +57,12 @@ def words_of(options):
     """Options of a job as those of the command."""
     for name, value in options.items():
         option = {"loads": "load"}.get(name, name.replace("_", "-"))
+        if name == "weights":
+            value = ",".join(f"{each:g}" for each in value)
         if value is True:
             yield f"--{option}"
         elif value is not None:
-            texts = (
-                [",".join(f"{each:g}" for each in value)]
-                if name == "weights"
-                else value
-                if isinstance(value, list)
-                else [value]
-            )
-            yield from (f"--{option}={text}" for text in texts)
+            yield from (f"--{option}={text}" for text in (value if isinstance(value, list) else [value]))
 
 
 def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=False):

@@ -119,6 +119,7 @@ def test_sizes_by_headers(image_path, tmp_path, monkeypatch):
     assert predict.size_by_headers(plan_of(tmp_path, [tmp_path / "b.png"])).n_read == 25
 
 
+@pytest.mark.deep
 def test_memory_of_a_small_run(image_path, tmp_path, monkeypatch):
     """run.json states sizes and prediction; nothing is far off. In a process of its own, as the model is of these."""
     words = [str(word) for word in mesh_words(image_path, tmp_path, "--nodes", "100", "--iterations", "1")]

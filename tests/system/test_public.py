@@ -39,12 +39,7 @@ RIGHT = {
     "load_phantom": {"name_or_path": "a.toml"},
     "mask_fidelity": {"mask": LABELS, "mesh": MESH},
     "mesh_image": {
-        "image": IMAGE,
-        "nodes": 100,
-        "target_error": None,
-        "start": None,
-        "spacing": None,
-        "sizes": None,
+        "image": IMAGE, "nodes": 100, "target_error": None, "start": None, "spacing": None, "sizes": None,
         "mode": "graded",
     },
     "build_model": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
@@ -67,7 +62,7 @@ RIGHT = {
     "solution_fields": {"mesh": MESH, "step": 1},
     "solve": {"model": MODEL, "step": 1},
     "extract_surface": {"points": MESH.points, "cells": MESH.cells, "chosen": [True]},
-}
+}  # fmt: skip
 WRONG = {
     "a text": "x.nii.gz",
     "a path": Path("x.nii.gz"),
@@ -129,29 +124,26 @@ def test_every_type_of_a_public_name_is_public():
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_right_kinds_are_taken(name):
-    check_arguments(inspect.unwrap(getattr(tetopt, name)), RIGHT[name])
-
-
-@pytest.mark.parametrize(("name", "argument"), [(name, argument) for name in RIGHT for argument in RIGHT[name]])
-def test_wrong_kinds_are_one_line(name, argument):
+def test_right_kinds_are_taken_and_wrong_ones_are_one_line(name):
     """Each argument is replaced by all that it can hardly be: no error but InputError, on one line that names it."""
-    lines = []
-    for value in WRONG.values():
-        try:
-            check_arguments(inspect.unwrap(getattr(tetopt, name)), {argument: value})
-        except tetopt.InputError as error:
-            lines.append(str(error))
-    assert len(lines) >= 8
-    assert all(line.startswith(f"{name}: {argument}: expected ") for line in lines)
-    assert all("\n" not in line and len(line) < 300 for line in lines)
+    function = inspect.unwrap(getattr(tetopt, name))
+    check_arguments(function, RIGHT[name])
+    for argument in RIGHT[name]:
+        lines = []
+        for value in WRONG.values():
+            try:
+                check_arguments(function, {argument: value})
+            except tetopt.InputError as error:
+                lines.append(str(error))
+        assert len(lines) >= 8
+        assert all(line.startswith(f"{name}: {argument}: expected ") for line in lines)
+        assert all("\n" not in line and len(line) < 300 for line in lines)
 
 
-@pytest.mark.parametrize("what", ["a text", "a path", "an array", "nibabel's", "None", "a number", "a bool"])
+@pytest.mark.parametrize("what", ["a text", "nibabel's", "None"])
 def test_what_is_no_image_is_told_how_to_become_one(what):
-    for call in (tetopt.mesh_image, tetopt.octree_mesh, tetopt.cell_fields):
-        with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; tetopt\.(load|Image)"):
-            call(WRONG[what], 500) if call is not tetopt.cell_fields else call(WRONG[what])
+    with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; tetopt\.(load|Image)"):
+        tetopt.mesh_image(WRONG[what], 500)
 
 
 def test_records_are_looked_into():
@@ -169,10 +161,10 @@ def test_a_mesh_of_anything(arrays):
         tetopt.Mesh(*arrays)
 
 
-@pytest.mark.parametrize("what", [what for what in WRONG if what != "an array"])
-def test_an_image_of_anything(what):
-    with pytest.raises(tetopt.InputError, match="image data: "):
-        tetopt.Image(WRONG[what])
+def test_an_image_of_anything():
+    for value in (each for what, each in WRONG.items() if what != "an array"):
+        with pytest.raises(tetopt.InputError, match="image data: "):
+            tetopt.Image(value)
 
 
 def test_a_decorated_function_is_looked_at():

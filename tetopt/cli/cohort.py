@@ -24,14 +24,14 @@ from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
 from tetopt.job.events import Event, listened
-from tetopt.job.options import RunOptions
+from tetopt.job.options import Option, RunOptions
 from tetopt.system.budget import memory_words
 
 
 def cohort_command(
     context: typer.Context,
     subjects: Annotated[
-        Path, typer.Argument(metavar="SUBJECTS", help="A table, .tsv or .csv: subject, image, ...; or a BIDS folder.")
+        Path, Option("SUBJECTS", "A table, .tsv or .csv: subject, image, ...; or a BIDS folder.", is_argument=True)
     ],
     cohort: CohortOptions,
     options: RunOptions,

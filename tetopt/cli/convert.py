@@ -5,31 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.markup import escape
 
 from tetopt.cli.console import out, show_event
-from tetopt.cli.options import MeshArgument, NumberOptions, option
+from tetopt.cli.options import MeshArgument, NumberOptions
 from tetopt.cli.solver import print_model
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
-from tetopt.job.options import LabelledPart, SolverOptions
-from tetopt.system.files import checked_output, save_json
+from tetopt.job.options import LabelledPart, Option, SolverOptions
+from tetopt.system.files import checked_output
 
 
 def convert_command(
     mesh_path: MeshArgument,
-    output: Annotated[
-        Path, typer.Argument(metavar="OUT", help=f"The file to write: {', '.join(FORMATS)}.", show_default=False)
-    ],
+    output: Annotated[Path, Option("OUT", f"The file to write: {', '.join(FORMATS)}.", is_argument=True)],
     image_path: Annotated[
-        Path | None, option("IMAGE", "Take means and mappings from this image, not from the mesh's file.", "--image")
+        Path | None, Option("IMAGE", "Take means and mappings from this image, not from the mesh's file.", "image")
     ] = None,
-    mask_path: Annotated[Path | None, option("MASK", "With --image: only what lies in it counts.", "--mask")] = None,
+    mask_path: Annotated[Path | None, Option("MASK", "With `image`: only what lies in it counts.", "mask")] = None,
     results_path: Annotated[
         Path | None,
-        option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (VTK's formats).", "--results"),
+        Option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (VTK's formats).", "results"),
     ] = None,
     *,
     part: LabelledPart,
@@ -39,13 +36,12 @@ def convert_command(
     """Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix."""
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
-    json_path = numbers.checked()
+    numbers.check()
     with listened(_show):
         came = convert_file(
             mesh_path, output, solver=solver, part=part, image=image_path, mask=mask_path, results=results_path
         )
-    if json_path is not None:
-        save_json(json_path, came.numbers)
+    numbers.save(came.numbers)
     print_model(output, came.model, came.options)
     return 0
 

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import print_wide
-from tetopt.cli.options import NumberOptions, option
+from tetopt.cli.options import NumberOptions
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.options import LabelledPart, ModelOptions
+from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.job.solve import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import checked_output
 
 SHOWN_FRACTION = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 
@@ -27,23 +26,26 @@ SHOWN_FRACTION = 1e-9  # of a force's largest component: less is what an iterati
 def fem_command(
     paths: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="[IMAGE] MESH",
-            help="VTU, VTK or MSH file; with moduli and loads it needs no more. Mappings are of IMAGE's intensities.",
+        Option(
+            "[IMAGE] MESH",
+            "VTU, VTK or MSH file; with moduli and loads it needs no more. Mappings are of IMAGE's intensities.",
+            is_argument=True,
         ),
     ],
     compress: Annotated[
         float | None,
-        option("PERCENT", f"Push the bottom in by this much, the top held (with IMAGE by default {PAPER_PERCENT:g})."),
+        Option("PERCENT", f"Push the bottom in by this much, the top held (with IMAGE by default {PAPER_PERCENT:g})."),
     ] = None,
     conditioning: Annotated[
         bool | None,
-        typer.Option(
-            help="Condition number of the first step's stiffness (default: for the compression of an IMAGE's box)."
+        Option(
+            None,
+            "Condition number of the first step's stiffness (default: for the compression of an IMAGE's box).",
+            "conditioning/--no-conditioning",
         ),
     ] = None,
     output: Annotated[
-        Path | None, option("SOLVED.vtu", "Write displacements, strains and stresses on the mesh.", "-o", "--output")
+        Path | None, Option("SOLVED.vtu", "Write displacements, strains and stresses on the mesh.", letter="o")
     ] = None,
     *,
     model: ModelOptions,
@@ -59,7 +61,7 @@ def fem_command(
     if len(paths) > 2:
         raise InputError(f"expected [IMAGE] MESH, got {len(paths)} files")
     *images, mesh_path = paths
-    json_path = numbers.checked()
+    numbers.check()
     if output is not None:
         output = checked_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
@@ -69,8 +71,7 @@ def fem_command(
         conditioning=conditioning,
     )  # fmt: skip
     _print(mesh_path.name, came)
-    if json_path is not None:
-        save_json(json_path, came.numbers)
+    numbers.save(came.numbers)
     return 0
 
 

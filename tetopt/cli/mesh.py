@@ -10,14 +10,14 @@ from rich.markup import escape
 
 from tetopt.cli.console import out, print_fidelity
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
-from tetopt.cli.options import ForceOption, PredictOption, option
+from tetopt.cli.options import ForceOption, PredictOption
 from tetopt.cli.predict import print_parts, print_prediction
 from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
 from tetopt.io.mni import mni_path
 from tetopt.job.events import listened
 from tetopt.job.job import Job
-from tetopt.job.options import DEFAULT_NODES, has_model
+from tetopt.job.options import DEFAULT_NODES, Option, has_model
 from tetopt.job.read import read
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
@@ -90,9 +90,9 @@ def _print_comparison(result: Result, n_empty: int) -> None:
 
 
 def demo_command(
-    output: Annotated[Path, option("DIR", "Folder for the results.", "-o", "--output")] = Path("demo"),
-    nodes: Annotated[int, option("N", "Wanted number of nodes.")] = DEFAULT_NODES[3],
-    iterations: Annotated[int | None, option("I", "Sweeps over all nodes.", min=0)] = None,
+    output: Annotated[Path, Option("DIR", "Folder for the results.", letter="o")] = Path("demo"),
+    nodes: Annotated[int, Option("N", "Wanted number of nodes.")] = DEFAULT_NODES[3],
+    iterations: Annotated[int | None, Option("I", "Sweeps over all nodes.", least=0)] = None,
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""

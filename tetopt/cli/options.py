@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args, get_type_hints
 
 import typer
-from typer.models import OptionInfo
 
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
 from tetopt.errors import InputError
@@ -25,25 +23,19 @@ from tetopt.job.options import (
     JsonOption,
     LabelNamesOption,
     Option,
+    has_option,
     kinds_of,
     option_name,
+    option_of,
 )
-from tetopt.system.files import checked_output, name_files
+from tetopt.system.files import checked_output, name_files, save_json
 from tetopt.system.public import LARGEST_INTEGER
 
-
-def option(metavar: str | None, text: str, *names: str, **more: Any) -> Any:
-    """`typer.Option` in one line: what its value is called, and what the help says of it."""
-    return typer.Option(*names, metavar=metavar, help=text, **more)
-
-
-ImageArgument = Annotated[Path, typer.Argument(metavar="IMAGE", help=IMAGE_FILES)]
+ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
-    Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
+    Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra or triangles.", is_argument=True)
 ]
-PredictOption = Annotated[
-    bool, typer.Option("--predict", help="Tell how long the run takes and how much memory, and write nothing.")
-]
+PredictOption = Annotated[bool, Option(None, "Tell how long the run takes and how much memory, and write nothing.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,25 +45,31 @@ class NumberOptions:
     json_path: JsonOption = None
     force: ForceOption = False
 
-    def checked(self) -> Path | None:
-        """The file, if there is to be one; InputError if it may not be written."""
-        return None if self.json_path is None else checked_output(self.json_path, (".json",), self.force)
+    def check(self) -> None:
+        """InputError if the file may not be written."""
+        if self.json_path is not None:
+            checked_output(self.json_path, (".json",), self.force)
+
+    def save(self, numbers: dict[str, Any]) -> None:
+        """Write the file, if there is to be one."""
+        if self.json_path is not None:
+            save_json(self.json_path, numbers)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShownOptions:
     """How `tetopt view` shows a mesh, and where."""
 
-    html: Annotated[Path | None, option("OUT.html", "Write the page there, and open no browser.", "--html")] = None
-    screenshot: Annotated[Path | None, option("OUT.png", "Write how it opens as a picture, and open no browser.")] = (
+    html: Annotated[Path | None, Option("OUT.html", "Write the page there, and open no browser.")] = None
+    screenshot: Annotated[Path | None, Option("OUT.png", "Write how it opens as a picture, and open no browser.")] = (
         None
     )
     field: Annotated[
-        str | None, option("NAME", "Colour by this at first: mean, label, von_mises, ... (default: the first).")
+        str | None, Option("NAME", "Colour by this at first: mean, label, von_mises, ... (default: the first).")
     ] = None
     limits: Annotated[
         str | None,
-        option("LOW,HIGH", "What its colours go from and to (default: all but 1 % at either end).", "--range"),
+        Option("LOW,HIGH", "What its colours go from and to (default: all but 1 % at either end).", "range"),
     ] = None
     label_names: LabelNamesOption = None
 
@@ -94,7 +92,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     leaves = [each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)]
-    options = {name: long for name, kind, *_ in leaves if (long := _long_name(name, kind)) is not None}
+    options = {name: f"--{option_name(name, kind)}" for name, kind, *_ in leaves if has_option(kind)}
     OPTION_NAMES.update({long[2:].replace("-", "_"): long for long in options.values()} | options)
     parameters = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_typed(name, kind, panel))
@@ -117,22 +115,6 @@ def _leaves(name: str, kind: Any, default: Any, panel: str | None = None) -> Ite
         yield from _leaves(field.name, own, default, _panel_of(record, field.name) or panel)
 
 
-def _long_name(name: str, kind: Any) -> str | None:
-    """What the command line calls an option, with hyphens before it; None for what is no option."""
-    own = _option_in(kind)
-    if isinstance(own, Option):
-        return f"--{option_name(name, kind)}"
-    if own is None:
-        return None
-    names = [each for each in (own.default, *(own.param_decls or ())) if isinstance(each, str)]  # the first as well
-    return next((each for each in names if each.startswith("--")), f"--{name.replace('_', '-')}")
-
-
-def _option_in(kind: Any) -> Option | OptionInfo | None:
-    """What an annotation says of its option, if it is one."""
-    return next((each for each in get_args(kind)[1:] if isinstance(each, Option | OptionInfo)), None)
-
-
 def _panel_of(record: type, name: str) -> str | None:
     """The panel of the help that a field of a record stands in: that of the first class with one that brings it."""
     bringing = [each for each in reversed(record.__mro__) if name in getattr(each, "__dataclass_fields__", {})]
@@ -141,19 +123,14 @@ def _panel_of(record: type, name: str) -> str | None:
 
 def _typed(name: str, kind: Any, panel: str | None) -> Any:
     """The annotation as typer takes it, its option in a panel of the help; arguments have one of their own."""
-    own = _option_in(kind)
-    if isinstance(own, Option):
-        text = with_hyphens(own.text)
-        if own.is_argument:
-            return Annotated[get_args(kind)[0], typer.Argument(metavar=own.metavar, help=text)]
-        names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
-        made = option(own.metavar, text, *names, min=own.least)
-    elif own is None or panel is None:
+    if not has_option(kind):
         return kind
-    else:
-        made = copy(own)
-    made.rich_help_panel = panel
-    return Annotated[get_args(kind)[0], made]
+    own = option_of(kind)
+    about: dict[str, Any] = {"metavar": own.metavar, "help": with_hyphens(own.text)}
+    if own.is_argument:
+        return Annotated[get_args(kind)[0], typer.Argument(**about)]
+    names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
+    return Annotated[get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
 
 
 def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:

@@ -6,27 +6,27 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from rich.markup import escape
 
 from tetopt import Image, InputError, load_phantom, save_image
 from tetopt.cli.console import out
-from tetopt.cli.options import ForceOption, option
+from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
+from tetopt.job.options import Option
 from tetopt.system.files import checked_output
 
 
 def phantom_command(
-    name: Annotated[str, typer.Argument(metavar="NAME_OR_TOML", help="A phantom's name, or a TOML file of your own.")],
+    name: Annotated[str, Option("NAME_OR_TOML", "A phantom's name, or a TOML file of your own.", is_argument=True)],
     output: Annotated[
-        Path, option("IMAGE.nii.gz", "The image to write; X.zarr by chunks, as 16-bit whole numbers.", "-o", "--output")
+        Path, Option("IMAGE.nii.gz", "The image to write; X.zarr by chunks, as 16-bit whole numbers.", letter="o")
     ],
-    voxel_mm: Annotated[float | None, option("MM", "Voxel size instead of the phantom's.")] = None,
-    blur_mm: Annotated[float | None, option("MM", "Standard deviation of a Gaussian blur.")] = None,
-    noise_sd: Annotated[float | None, option("SD", "Standard deviation of added noise.")] = None,
-    seed: Annotated[int | None, option("N", "Seed of the noise.")] = None,
-    labels: Annotated[Path | None, option("LABELS.nii.gz", "Write the label of each voxel's centre, too.")] = None,
+    voxel_mm: Annotated[float | None, Option("MM", "Voxel size instead of the phantom's.")] = None,
+    blur_mm: Annotated[float | None, Option("MM", "Standard deviation of a Gaussian blur.")] = None,
+    noise_sd: Annotated[float | None, Option("SD", "Standard deviation of added noise.")] = None,
+    seed: Annotated[int | None, Option("N", "Seed of the noise.")] = None,
+    labels: Annotated[Path | None, Option("LABELS.nii.gz", "Write the label of each voxel's centre, too.")] = None,
     force: ForceOption = False,
 ) -> int:
     """Write a phantom as an image: known shapes, known intensities."""

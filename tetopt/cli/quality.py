@@ -5,35 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.markup import escape
 from rich.table import Table
 
 from tetopt.cli.console import out, print_fidelity
-from tetopt.cli.options import NumberOptions, option
+from tetopt.cli.options import NumberOptions
 from tetopt.job.judge import Judgement, judge
-from tetopt.job.options import ImagePart, LabelNamesOption
+from tetopt.job.options import ImagePart, LabelNamesOption, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
 from tetopt.report.tables import add_quality, new_table
-from tetopt.system.files import save_json
 
 
 def quality_command(
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file of tetrahedra or triangles.")],
-    image_path: Annotated[Path | None, option("IMAGE", "Measure E_D against this image, too.", "--image")] = None,
-    mask_path: Annotated[
-        Path | None, option("MASK", "How well the boundary follows it; with --image.", "--mask")
-    ] = None,
-    labels_path: Annotated[
-        Path | None, option("LABELS", "How well cells keep to them; with --image.", "--labels")
-    ] = None,
+    mesh: Annotated[Path, Option("MESH", "VTU, VTK or MSH file of tetrahedra or triangles.", is_argument=True)],
+    image: Annotated[Path | None, Option("IMAGE", "Measure E_D against this image, too.")] = None,
+    mask: Annotated[Path | None, Option("MASK", "How well the boundary follows it; with `image`.")] = None,
+    labels: Annotated[Path | None, Option("LABELS", "How well cells keep to them; with `image`.")] = None,
     check: Annotated[
         bool,
-        typer.Option(
-            "--check",
-            help="Is it a mesh, with a manifold boundary? With --image, does it fill the box, and meet what its "
-            "run was asked for? Exit 1 if not.",
+        Option(
+            None,
+            "Is it a mesh, with a manifold boundary? With `image`, does it fill the box, and meet what its run was "
+            "asked for? Exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,
@@ -42,12 +36,11 @@ def quality_command(
     numbers: NumberOptions,
 ) -> int:
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
-    json_path = numbers.checked()
-    came = judge(mesh_path, image_path, mask_path, labels_path, part=part, label_names=label_names, check=check)
-    if json_path is not None:
-        save_json(json_path, came.numbers)
+    numbers.check()
+    came = judge(mesh, image, mask, labels, part=part, label_names=label_names, check=check)
+    numbers.save(came.numbers)
     size, source = came.numbers["size"], came.source
-    table = new_table("", escape(mesh_path.name))
+    table = new_table("", escape(mesh.name))
     add_quality(table, came.shape, in_all=[size["n_nodes_in_all"]] if came.loaded.order == 2 else [])
     if source is not None and came.fit is not None:
         _add_fit(table, came.fit, source, came.left_out)

@@ -6,27 +6,26 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
-from tetopt.cli.options import ImageArgument, NumberOptions, option
+from tetopt.cli.options import ImageArgument, NumberOptions
 from tetopt.energy.sampling import overlap_of
 from tetopt.job.inputs import read_image, read_labels, read_mesh, warn_of_other_image
-from tetopt.job.options import ImagePart
+from tetopt.job.options import ImagePart, Option
 from tetopt.report.tables import new_table
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import checked_output
 
 
 def segment_command(
     image_path: ImageArgument,
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file over the image.")],
-    output: Annotated[Path, option("LABELS.nii.gz", "The labels to write.", "-o", "--output")],
-    classes: Annotated[int, option("K", "Number of classes, by rising mean.", min=2)] = 4,
+    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or MSH file over the image.", is_argument=True)],
+    output: Annotated[Path, Option("LABELS.nii.gz", "The labels to write.", letter="o")],
+    classes: Annotated[int, Option("K", "Number of classes, by rising mean.", least=2)] = 4,
     truth_path: Annotated[
-        Path | None, option("LABELS", "True labels: print the Dice overlap with them.", "--truth")
+        Path | None, Option("LABELS", "True labels: print the Dice overlap with them.", "truth")
     ] = None,
     *,
     part: ImagePart,
@@ -36,7 +35,7 @@ def segment_command(
     from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
-    json_path = numbers.checked()
+    numbers.check()
     image = read_image(image_path, part)
     truth = None if truth_path is None else read_labels(truth_path, image, part)
     mesh = _mesh_over(mesh_path, image, image_path)
@@ -67,8 +66,7 @@ def segment_command(
         for label in by_mesh:
             overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
     save_image(output, labels)
-    if json_path is not None:
-        save_json(json_path, report)
+    numbers.save(report)
     out.print(table)
     if truth is not None:
         out.print(overlaps)

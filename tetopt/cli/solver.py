@@ -13,6 +13,7 @@ from tetopt.io.formats import format_of
 from tetopt.io.gmsh import incomplete_groups
 from tetopt.io.tags import group_of_zero, label_lines, numbered_parts
 from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.inputs import listed
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
@@ -23,7 +24,6 @@ from tetopt.report.tables import new_table, nodes_in_words
 
 GMSH_SUFFIXES = (".msh", ".msh2")
 CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # what the formats call the number of a cell
-LISTED_NAMES = 8  # of labels of one material: a line's worth
 
 
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
@@ -50,8 +50,7 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
         return
     for number, (young, nu) in enumerate(zip(materials.young, materials.nu, strict=True)):
         made_of = [names.get(label, str(label)) for label, material in pairs if material == number]
-        more = f" and {len(made_of) - LISTED_NAMES} more" if len(made_of) > LISTED_NAMES else ""
-        yield f"  {young:.4g} kPa, nu {nu:.4g}: {', '.join(made_of[:LISTED_NAMES])}{more}"
+        yield f"  {young:.4g} kPa, nu {nu:.4g}: {listed(made_of)}"
 
 
 def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:

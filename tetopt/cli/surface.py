@@ -8,23 +8,24 @@ from typing import Annotated
 from rich.markup import escape
 
 from tetopt.cli.console import out
-from tetopt.cli.options import MeshArgument, NumberOptions, option
+from tetopt.cli.options import MeshArgument, NumberOptions
 from tetopt.io.surfaces import SURFACE_SUFFIXES
+from tetopt.job.options import Option
 from tetopt.job.surface import SurfacePart, write_surface
 from tetopt.report.tables import new_table
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import checked_output
 
 
 def surface_command(
     mesh_path: MeshArgument,
-    output: Annotated[Path, option("OUT.stl", "Surface to write: STL, PLY, VTP or VTK.", "-o", "--output")],
+    output: Annotated[Path, Option("OUT.stl", "Surface to write: STL, PLY, VTP or VTK.", letter="o")],
     *,
     part: SurfacePart,
     numbers: NumberOptions,
 ) -> int:
     """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area."""
     output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
-    json_path = numbers.checked()
+    numbers.check()
     written = write_surface(mesh_path, output, part)
     table = new_table(*map(escape, written.heads))
     for row in written.rows:
@@ -32,6 +33,5 @@ def surface_command(
     out.print(table)
     for line in written.lines:
         out.print(line)
-    if json_path is not None:
-        save_json(json_path, written.numbers)
+    numbers.save(written.numbers)
     return 0 if written.is_sound else 1

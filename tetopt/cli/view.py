@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import out
-from tetopt.cli.options import ForceOption, ShownOptions, option
-from tetopt.job.inputs import label_table, number_of, read_image, read_mesh, warn_of_other_image
-from tetopt.job.options import BoxPart
+from tetopt.cli.options import ForceOption, ShownOptions
+from tetopt.job.inputs import label_table, number_of, read_image, read_mesh, table_in, warn_of_other_image
+from tetopt.job.options import BoxPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
@@ -27,8 +26,8 @@ from tetopt.system.incoming import json_of
 
 
 def view_command(
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra.")],
-    image_path: Annotated[Path | None, option("IMAGE", "Show its slice behind the mesh's section.", "--image")] = None,
+    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra.", is_argument=True)],
+    image_path: Annotated[Path | None, Option("IMAGE", "Show its slice behind the mesh's section.", "image")] = None,
     *,
     how: ShownOptions,
     part: BoxPart,
@@ -95,13 +94,9 @@ def _only_labels(loaded: MeshFile) -> str | None:
 
     A mesh with results on its nodes opens on these.
     """
-    try:
-        inputs = json_of(loaded.text("inputs") or "{}")
-        weights = [float(each) for each in inputs.get("weights") or [1.0]]
-    except (TypeError, ValueError, AttributeError):  # another program's
-        return None
-    is_told = "label" in loaded.cell_data and not any(weights) and not loaded.point_data
-    return "label" if is_told else None
+    weights = table_in(loaded, "inputs").get("weights")
+    are_alone = isinstance(weights, list) and len(weights) > 0 and not any(weights)
+    return "label" if are_alone and "label" in loaded.cell_data and not loaded.point_data else None
 
 
 def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:

@@ -13,6 +13,7 @@ from tetopt.engine.meshing import Mode
 from tetopt.engine.requirements import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import violated, warning
+from tetopt.job.inputs import listed
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.model.labels import label_words
@@ -63,10 +64,9 @@ def _lost(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
         warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
-        first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
         warning(
-            f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels; allow "
-            "more nodes, or follow every voxel by `smooth_interfaces` 0"
+            f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: cells are too large for them, or these are no "
+            "labels; allow more nodes, or follow every voxel by `smooth_interfaces` 0"
         )
 
 

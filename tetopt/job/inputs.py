@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.align import is_same_grid, resample_contrast
+from tetopt.contents.content import SMOOTH_INTERFACES
 from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -25,9 +27,10 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
 from tetopt.system.files import checked_output
+from tetopt.system.incoming import json_of
 
 IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
-UNNAMED_LISTED = 8  # of those that have no name: a line's worth
+NAMES_LISTED = 8  # a line's worth
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
 
@@ -124,11 +127,21 @@ def number_of(name: str, text: str) -> float:
         raise InputError(f'{name}: expected a number, got "{text}"') from None
 
 
-def weights_of(options: SourceOptions) -> list[float]:
-    """How much each image counts."""
-    if options.weights is None:
-        return [1.0] * len(options.images)
-    return [number_of("`weights`", part) for part in options.weights.split(",")]
+class Balance(NamedTuple):
+    """How much images and labels count beside one another, and how tense surfaces between labels are."""
+
+    weights: list[float]
+    label_weight: float = 1.0
+    smooth_interfaces: float = SMOOTH_INTERFACES
+
+
+def balance_of(options: SourceOptions) -> Balance:
+    """The balance that is asked for, with its defaults."""
+    weights = [1.0] * len(options.images)
+    if options.weights is not None:
+        weights = [number_of("`weights`", part) for part in options.weights.split(",")]
+    names = ("label_weight", "smooth_interfaces")
+    return Balance(weights, **{name: each for name in names if (each := getattr(options, name)) is not None})
 
 
 def read_mesh(path: Path) -> MeshFile:
@@ -163,15 +176,24 @@ def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable
         table = load_label_table(path)
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
-            warning(f"{path}: names none of the mesh's labels, {_first(np.unique(labels).tolist())}")
+            warning(f"{path}: names none of the mesh's labels, {listed(np.unique(labels).tolist())}")
         return table
     return NO_TABLE if loaded is None else loaded.label_table
 
 
-def _first(labels: list[int]) -> str:
-    """The first of some labels, in words."""
-    more = f" and {len(labels) - UNNAMED_LISTED} more" if len(labels) > UNNAMED_LISTED else ""
-    return ", ".join(map(str, labels[:UNNAMED_LISTED])) + more
+def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
+    """The first of some names in words, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(str, names[:most])) + more
+
+
+def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
+    """A table among the texts of a mesh's file; empty without one, or if it is another program's."""
+    try:
+        table = json_of(loaded.text(name) or "{}")
+    except ValueError:
+        return {}
+    return table if isinstance(table, dict) else {}
 
 
 def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:

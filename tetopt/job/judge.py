@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
-from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image
+from tetopt.job.inputs import label_table, read_mesh, table_in, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
@@ -22,7 +22,6 @@ from tetopt.measure.quality import Quality, quality
 from tetopt.measure.requirements import judged
 from tetopt.model.file import MeshFile
 from tetopt.report.summary import fidelity, size_summary
-from tetopt.system.incoming import json_of
 
 
 class Judgement(NamedTuple):
@@ -41,17 +40,35 @@ class Judgement(NamedTuple):
     @property
     def is_masked(self) -> bool:
         """Whether it was made within a mask or without a background."""
-        return _was_masked(self.loaded) or (self.source is not None and self.source.mask is not None)
+        inputs = table_in(self.loaded, "inputs")
+        was_masked = inputs.get("mask") is not None or inputs.get("background") is not None
+        return was_masked or (self.source is not None and self.source.mask is not None)
 
     @property
     def is_filled(self) -> bool:
-        """Whether it should fill the image's box."""
-        return _fills_box(self.loaded, self.source)
+        """Whether it should fill the image's box: not within a mask, and not of another mesh's domain."""
+        return not self.is_masked and table_in(self.loaded, "options").get("start") is None
 
     @property
     def left_out(self) -> list[str]:
         """What counted for the run that made it, and does not here."""
-        return [] if self.source is None else _left_out(self.loaded, self.source)
+        if self.source is None:
+            return []
+        inputs, there = table_in(self.loaded, "inputs"), {"mask": self.source.mask, "labels": self.source.labels}
+        left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
+        images = inputs.get("images")
+        return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
+
+    @property
+    def requirements(self) -> dict[str, Any]:
+        """What the run that made it was asked for, as its file says; another program's mesh only fills the box."""
+        options = table_in(self.loaded, "options")  # of ours alone with a method
+        is_kept = options.get("method") == "fast" and options.get("iterations") != 0
+        return {
+            "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
+            "target_error": None if self.left_out else _number(options.get("target_error")),
+            "is_filled": "method" in options and self.is_filled,
+        }
 
     def tell(self) -> list[str]:
         """Tell what is wrong with it; that, a line each. What is only good to know is a warning."""
@@ -94,12 +111,12 @@ def judge(
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
-        source = _source(loaded, image, mask, labels, part)
-        fit, result, measured = _measured(loaded, source)
+        judgement = judgement._replace(source=_source(loaded, image, mask, labels, part))
+        fit, result, measured = _measured(judgement)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
         warn_of_other_image(loaded, mesh, image)
         numbers |= {**measured, "image": image.name, "fit": fit}
-        judgement = judgement._replace(source=source, fit=fit, result=result, measured=measured)
+        judgement = judgement._replace(fit=fit, result=result, measured=measured)
     if check:
         problems, remarks = _checked(judgement)
         numbers |= {"problems": problems, "remarks": remarks}
@@ -109,7 +126,7 @@ def judge(
 
 def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
     """What the mesh is measured on: the files named here, weighed as the mesh's file says that they were."""
-    inputs = _texts(loaded, "inputs")
+    inputs = table_in(loaded, "inputs")
     level, tension, weight = (_number(inputs.get(name)) for name in ("background", "smooth_interfaces", "label_weight"))
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
@@ -124,42 +141,17 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
     return read_source(options)
 
 
-def _measured(loaded: MeshFile, source: Source) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
+def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
     """How well the cells fit the image; the mesh as the result of a run; how well mask, labels and image are met."""
-    mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
+    source, mesh, of_cell = cast(Source, came.source), came.loaded.mesh, came.loaded.cell_data.get("label")
     fit = image_fit(source.image, mesh)
-    result = judged(mesh, source.content, of_cell, **_requirements(loaded, source))
+    result = judged(mesh, source.content, of_cell, **came.requirements)
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
     measured = fidelity(source.labels, source.mask, mesh, of_cell)
     if not (source.content.is_plain and source.content.region is None):
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
     return fit, result, measured
-
-
-def _requirements(loaded: MeshFile, source: Source) -> dict[str, Any]:
-    """What the run that made the mesh was asked for, as its file says; another program's mesh only fills the box."""
-    options = _texts(loaded, "options")  # of ours alone with a method
-    is_kept = options.get("method") == "fast" and options.get("iterations") != 0
-    return {
-        "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
-        "target_error": None if _left_out(loaded, source) else _number(options.get("target_error")),
-        "is_filled": "method" in options and _fills_box(loaded, source),
-    }
-
-
-def _left_out(loaded: MeshFile, source: Source) -> list[str]:
-    """What counted for the run that made the mesh, as its file says, and does not here."""
-    inputs, there = _texts(loaded, "inputs"), {"mask": source.mask, "labels": source.labels}
-    left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
-    images = inputs.get("images")
-    return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
-
-
-def _fills_box(loaded: MeshFile, source: Source | None) -> bool:
-    """Whether the mesh should fill the image's box: not within a mask, and not of another mesh's domain."""
-    is_masked = _was_masked(loaded) or (source is not None and source.mask is not None)
-    return not is_masked and _texts(loaded, "options").get("start") is None
 
 
 def _number(value: Any) -> float | None:
@@ -179,7 +171,7 @@ def _checked(came: Judgement) -> tuple[list[str], list[str]]:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
         touching = manifold_problems(mesh, labels)
-    is_smooth = (_number(_texts(came.loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    is_smooth = (_number(table_in(came.loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
     return (touching, []) if is_smooth else ([], touching)
 
 
@@ -187,18 +179,3 @@ def _names(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> dict[str,
     """What those of the labels that have a name are called, as "label_names"; nothing if none has."""
     of_rows = {row.label: names[row.label] for row in rows if row.label in names}
     return {"label_names": of_rows} if of_rows else {}
-
-
-def _was_masked(loaded: MeshFile) -> bool:
-    """Whether the file says that it was made within a mask or without a background."""
-    inputs = _texts(loaded, "inputs")
-    return inputs.get("mask") is not None or inputs.get("background") is not None
-
-
-def _texts(loaded: MeshFile, name: str) -> dict[str, Any]:
-    """A table among the texts of the mesh's file; empty without one, or if it is another program's."""
-    try:
-        table = json_of(loaded.text(name) or "{}")
-    except ValueError:
-        return {}
-    return table if isinstance(table, dict) else {}

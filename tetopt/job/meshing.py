@@ -83,7 +83,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     result = mesh_image(
         content, job.nodes, target_error=job.target_error, mode=task.plan.mode,
         start=None if task.started is None else task.started.mesh, spacing=job.spacing, kind=kind, sizes=task.sizes,
-        order=job.order or 1, watch=watch, **options,
+        order=task.plan.order, watch=watch, **options,
     )  # fmt: skip
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
@@ -172,7 +172,7 @@ def watched(
 def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     """A line for a run of several, which go on until one is near to an error, or to a number of nodes of order 2."""
     job, content = task.plan.job, task.source.content
-    n_nodes = node_count(result.mesh.points, result.mesh.cells, job.order or 1)
+    n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
         fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
         note(

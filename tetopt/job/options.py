@@ -385,6 +385,11 @@ def _known_kinds(record: Any) -> dict[str, Any]:
     return {field.name: kinds[field.name] for field in fields(record)}
 
 
+def has_option(kind: Any) -> bool:
+    """Whether an annotation says anything of an option."""
+    return any(isinstance(each, Option) for each in get_args(kind)[1:])
+
+
 def option_of(kind: Any) -> Option:
     """What an annotation says of its option."""
     return next(each for each in get_args(kind)[1:] if isinstance(each, Option))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.content import SMOOTH_INTERFACES, Content, check_weights
+from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
@@ -16,7 +16,7 @@ from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
 from tetopt.io.images import parse_crop, parse_slice
-from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
+from tetopt.job.inputs import balance_of, checked_outputs, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
 from tetopt.parts.division import Division
@@ -60,6 +60,11 @@ class Plan(NamedTuple):
     division: Division = Division()
     left: VolumeFile | None = None
     pictures: Sequence[Path] = ()
+
+    @property
+    def order(self) -> int:
+        """Of the cells, 1 or 2: linear ones by default."""
+        return self.job.order or 1
 
     @property
     def engine_options(self) -> dict[str, Any]:
@@ -196,8 +201,7 @@ def _check_source(job: JobOptions) -> None:
 
 def _check_numbers(job: JobOptions) -> None:
     """InputError for numbers that are none of their options', whatever the image is."""
-    tension = SMOOTH_INTERFACES if job.smooth_interfaces is None else job.smooth_interfaces
-    check_weights(len(job.images), weights_of(job), job.label_weight or 0.0, tension)
+    check_weights(len(job.images), *balance_of(job))
     if job.background not in (None, "auto"):
         number_of("`background`", str(job.background))
     if job.crop is not None:
@@ -297,7 +301,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
         return plan._replace(job=changed(job, nodes=nodes)), None
-    order, nodes, limits = job.order or 1, job.nodes, _limits(job)
+    order, nodes, limits = plan.order, job.nodes, _limits(job)
     if not is_counted:
         nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
     limits = sizes_of_order(content, nodes, limits, order)

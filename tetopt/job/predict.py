@@ -71,11 +71,11 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
     if job.slice_ is not None:
         axis, _ = parse_slice(job.slice_)
         shape = shape[:axis] + shape[axis + 1 :]
-    size = _size(plan, shape, plan.job.nodes)
+    size = _size(plan, shape, job.nodes)
     if like is None:
         return size
     n_voxels = round(size.n_read * like.n_voxels / like.n_read)
-    n_nodes = like.n_nodes if plan.job.nodes is None else size.n_nodes
+    n_nodes = like.n_nodes if job.nodes is None else size.n_nodes
     return size._replace(
         n_voxels=n_voxels, n_nodes=n_nodes, n_channels=like.n_channels, elongation=like.elongation,
         has_memberships=like.has_memberships, is_fractional=like.is_fractional,
@@ -107,7 +107,7 @@ def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:
 
 def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
     """What the options and headers tell of a run on voxels of this shape; each file is a channel."""
-    job, order, ndim = plan.job, plan.job.order or 1, len(shape)
+    job, order, ndim = plan.job, plan.order, len(shape)
     files = [*job.images, *(path for path in (job.mask, job.labels) if path is not None)]
     runs = SEARCH_RUNS if plan.job.target_error is not None else 1
     corners = float(DEFAULT_NODES[ndim] if nodes is None else nodes)

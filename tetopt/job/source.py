@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
-from tetopt.contents.content import SMOOTH_INTERFACES, Content, content, continued
+from tetopt.contents.content import Content, content, continued
 from tetopt.energy.sampling import cell_moments
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note
-from tetopt.job.inputs import image_and_others, label_table, number_of, weights_of
+from tetopt.job.inputs import balance_of, image_and_others, label_table, number_of
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
@@ -112,22 +112,17 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         note(
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
-    weights = weights_of(options)
+    balance = balance_of(options)
     if options.weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
         note("the image is its own labels: only these count")
-        weights = [0.0]
-    label_weight = 1.0 if options.label_weight is None else options.label_weight
-    tension = SMOOTH_INTERFACES if options.smooth_interfaces is None else options.smooth_interfaces
-    represented = content(
-        contrasts, labels, mask, weights=weights, label_weight=label_weight, smooth_interfaces=tension,
-        keep_components=options.keep_components,
-    )  # fmt: skip
+        balance = balance._replace(weights=[0.0])
+    represented = content(contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components)
     files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
     inputs = {
-        "images": [path.name for path in paths], "weights": weights,
+        "images": [path.name for path in paths], "weights": balance.weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
-        **({} if labels is None else {"smooth_interfaces": tension}),
+        **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
@@ -137,7 +132,7 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "inputs": inputs,
         "box": box_text(box_of(image)),
     }
-    source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
+    source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
 
 
