@@ -277,7 +277,7 @@ ALIASES = f"[&a0 [x], {', '.join(ROWS)}]"
             "jobqueue: {slurm: {env-extra: [a]}}",
             "expected keys of account, .*, got env-extra",
         ),  # jobs would not have it
-        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected a text in quotes, as "12:00:00".*got 43200'),
+        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected a text in quotes, as "12:00:00" .*got 43200'),
         ("jobqueue: {slurm: {cores: two}}", "expected whole numbers of cores .*'two'"),
         ("jobqueue: {slurm: {processes: 0}}", "expected whole numbers of cores .*got: processes 0"),
         ("jobqueue: {slurm: {memory: lots}}", "memory as '8 GB', .*'lots'"),

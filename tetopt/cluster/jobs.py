@@ -46,10 +46,12 @@ OLD_KEYS = {"extra", "job-extra", "env-extra"}
 MEMORY_NAMES = ("memory", "job-mem", "mem")
 # What must say the memory by the site's own words, as dask-jobqueue does not there.
 MEMORY_KEYS = {"sge": "resource-spec", "oar": "memory-per-core-property-name"}
-# Of values, by the types of dask-jobqueue's own; a time without quotes is a number of seconds for YAML.
+# Of values, by the types of dask-jobqueue's own.
 VALUE_WORDS: dict[type, str] = {
-    list: "a list of texts", dict: "keys with their values", str: 'a text in quotes, as "12:00:00"',
-}  # fmt: skip
+    list: "a list of texts",
+    dict: "keys with their values",
+    str: 'a text in quotes, as "12:00:00" (without, YAML reads a number)',
+}
 # In directives of a job neither blanks nor quotes can be relied on.
 PLAIN_PATH = re.compile(r"[\w./+@=:,-]+")
 
