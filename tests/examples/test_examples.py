@@ -16,6 +16,8 @@ from matplotlib import pyplot
 import tetopt
 from tetopt.io import formats
 
+pytestmark = pytest.mark.deep
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 RESULT = EXAMPLES / "plot_calculix.frd"
 
