@@ -28,6 +28,7 @@ def test_a_run_that_meets_all_violates_nothing(whole):
     assert whole[1].violated == {}
 
 
+@pytest.mark.full
 def test_the_minimum_dihedral_angle(whole):
     image, result = whole
     words = violated(image, result, 60.0)
@@ -55,6 +56,7 @@ def test_the_box_and_the_cover(whole):
     assert violated_request(image, fewer, None, False) == {}
 
 
+@pytest.mark.full
 def test_the_error(whole):
     image, result = whole
     fraction = result.history[-1].E_D / (plain(image).variance * image.volume)
@@ -64,6 +66,7 @@ def test_the_error(whole):
     assert ("error" in short.violated) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
 
 
+@pytest.mark.full
 def test_a_mask_and_overlaps():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
@@ -80,6 +83,7 @@ def test_a_mask_and_overlaps():
     assert set(violated(target, halved)) - {"components", "manifold"} == {"mask"}
 
 
+@pytest.mark.full
 def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
     """Two tetrahedra of the mesh that share a node, and two far apart, are all that is left."""
     image, mask = shaped("ball")
@@ -98,6 +102,7 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
         assert "2 connected components, the mask 1" in found["components"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"])
 def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(name, monkeypatch):
     def fail(*_):
@@ -133,6 +138,7 @@ def test_an_interface_that_touches_itself():
     assert f"[[{node}]]" in words["manifold"]
 
 
+@pytest.mark.full
 def test_labels_without_cells():
     image, _ = shaped("ball")
     labels = np.zeros(image.shape)
@@ -146,8 +152,14 @@ def test_labels_without_cells():
         "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
     }
     assert violated(target, result._replace(labels=None)) == {}
+    # Within a mask label 0 is the outside, too.
+    within = content(image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine))
+    no_zero = result._replace(labels=np.where(result.labels == 0, 3, result.labels))
+    assert "no cell has label 0" in violated(target, no_zero)["labels"]
+    assert "labels" not in violated(within, no_zero)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
 def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     image, mask = shaped("ball")
@@ -158,6 +170,7 @@ def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     assert not {"manifold", "labels"} & set(result.violated)
 
 
+@pytest.mark.full
 def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
     image, mask = shaped("ball")
     start = tetopt.mesh_image(content(image, mask=mask), 300, iterations=1).mesh
@@ -166,6 +179,7 @@ def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
     assert "labels" not in result.violated
 
 
+@pytest.mark.full
 def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
     image, _ = whole
     assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).violated == {}
