@@ -218,16 +218,6 @@ def test_labels_get_no_pieces_between_slices():
         assert set(piece[..., 2::5].ravel()) | {0} == set(range(n + 1))
 
 
-def test_two_axes_may_be_thick():
-    image = voxelised((1.0, 3.0, 3.0), (70, 24, 26))
-    members = memberships(image, supersampling(image.spacing))
-    assert members.partition.shape == (70, 72, 78)
-    np.testing.assert_array_equal(members.labels[members.partition][:, 1::3, 1::3], image.data)
-    affine = finer_affine(image.affine, (1, 3, 3))
-    true, _ = bumpy(grid(members.partition.shape) * np.diag(affine)[:3] + affine[:3, 3])
-    assert dice(members.labels[members.partition] == 8, true == 8) > 0.97
-
-
 def test_the_same_on_any_number_of_threads():
     image = voxelised((1.5, 1.5, 4.5), (44, 44, 16))
     before = numba.get_num_threads()

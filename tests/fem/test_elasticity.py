@@ -95,7 +95,7 @@ def textbook_stiffness(mesh, young, nu):
     return K
 
 
-@pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.49])
+@pytest.mark.parametrize("nu", [-0.5, 0.3])
 @pytest.mark.parametrize("case", ALL_SMALL)
 def test_stiffness_is_the_textbook_s(case, nu):
     mesh = Mesh(*case)
@@ -104,12 +104,11 @@ def test_stiffness_is_the_textbook_s(case, nu):
     np.testing.assert_allclose(stiffness(mesh, young, nu).toarray(), expected, atol=1e-13 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.45])
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [2, 3])
-def test_stiffness_is_scikit_fem_s(n, order, nu):
+def test_stiffness_is_scikit_fem_s(n, order):
     """Node by node: scikit-fem's dofs are matched to ours by where they lie."""
-    mesh = random_mesh(np.random.default_rng(5), n, 40)
+    mesh, nu = random_mesh(np.random.default_rng(5), n, 20), 0.45
     young = np.random.default_rng(6).uniform(1.0, 9.0, len(mesh.cells))
     K, place = skfem_stiffness(mesh, young, nu, order)
     points = mesh.points if order == 1 else quadratic(mesh.points, mesh.cells)[0]
@@ -180,21 +179,15 @@ def test_stiffness_adds_up():
     assert not both[:size, size:].any()
 
 
-def test_one_modulus_for_all():
-    mesh = random_mesh(np.random.default_rng(2), 2)
-    assert (stiffness(mesh, 3.0, 0.3) != stiffness(mesh, np.full(len(mesh.cells), 3.0), 0.3)).nnz == 0
-
-
 # Patch test
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.45])
 @pytest.mark.parametrize(
     "name", ["distorted criss-cross", "split square", "distorted bcc", "distorted five-tet", "split cube"]
 )
-def test_patch(name, nu):
+def test_patch(name):
     """A linear displacement of the boundary is that of every inner node; all cells have its strain, no node a force."""
-    rng = np.random.default_rng(7)
+    rng, nu = np.random.default_rng(7), 0.45
     mesh = {
         "distorted criss-cross": lambda: distorted(block((2.0, 3.0), (4, 5))[1], rng),
         "split square": lambda: random_mesh(rng, 2, 40),
@@ -219,21 +212,11 @@ def test_patch(name, nu):
     assert np.abs(force[~is_boundary]).max() < 1e-10 * np.abs(force).max()
 
 
-@given(seeds, dimensions)
-def test_strains_of_a_linear_field(seed, n):
-    rng = np.random.default_rng(seed)
-    mesh = random_mesh(rng, n)
-    slope = rng.normal(size=(n, n))
-    strain = strains(mesh, mesh.points @ slope.T)
-    np.testing.assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
-    np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
-
-
 # Closed forms
 
 
 @pytest.mark.parametrize("method", ["direct", "amg"])
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+@pytest.mark.parametrize("nu", [0.0, 0.45])
 @pytest.mark.parametrize("sides", [(2.0, 5.0), (2.0, 3.0, 5.0)])
 def test_uniform_block_between_smooth_plates(sides, nu, method):
     """Uniaxial stress, sides free: E_strain = 1/2 E eps^2 V, the force E eps A; it widens by nu eps."""
@@ -249,17 +232,6 @@ def test_uniform_block_between_smooth_plates(sides, nu, method):
         strains(distorted(mesh, np.random.default_rng(0)), pressed.u), np.broadcast_to(along, (len(mesh.cells), n, n)),
         atol=1e-10,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
-@pytest.mark.parametrize("sides", [(4.0, 5.0), (4.0, 3.0, 5.0)])
-def test_two_moduli_side_by_side_between_smooth_plates(sides, nu):
-    """Columns of one strain: 1/2 eps^2 (E_1 V_1 + E_2 V_2), whatever nu, since both widen alike."""
-    image, mesh = block(sides, (4,) * len(sides), None if len(sides) == 2 else "five-tet")
-    is_left = mesh.points[mesh.cells].mean(axis=1)[:, 0] < sides[0] / 4.0
-    pressed = squeezed(mesh, image, np.where(is_left, 1.0, 10.0), nu, is_bonded=False)
-    expected = 0.5 * 0.01**2 * np.prod(sides) * (0.25 * 1.0 + 0.75 * 10.0)
-    assert pressed.strain_energy == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.parametrize("is_bonded", [True, False])
@@ -357,46 +329,6 @@ def test_rotated(seed, n, is_bonded):
     np.testing.assert_allclose(other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max())
 
 
-@pytest.mark.parametrize("is_bonded", [True, False])
-@pytest.mark.parametrize("n", [2, 3])
-def test_scaling(n, is_bonded):
-    """Energy is linear in the moduli, quadratic in the push; a mesh s times as large at equal strain has s^n of it."""
-    rng = np.random.default_rng(4)
-    image, mesh = block((1.0, 2.0, 3.0)[:n], (2,) * n)
-    young = rng.uniform(1.0, 9.0, len(mesh.cells))
-    low, high = box_faces(image, mesh)
-    push = np.array([0.1, -0.2, 0.3])[:n]
-
-    def energy(size=1.0, factor=1.0, push=push):
-        scaled = Mesh(size * mesh.points, mesh.cells)
-        return compression(
-            scaled, factor * young, 0.45, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded
-        ).strain_energy
-
-    base = energy()
-    assert energy(factor=7.0) == pytest.approx(7.0 * base, rel=1e-10)
-    assert energy(push=-3.0 * push) == pytest.approx(9.0 * base, rel=1e-10)
-    assert energy(size=5.0, push=5.0 * push) == pytest.approx(5.0**n * base, rel=1e-10)
-    assert energy(size=5.0) == pytest.approx(5.0 ** (n - 2) * base, rel=1e-10)
-
-
-def test_holding_more_and_stiffening_take_more_energy():
-    """Smooth plates allow all that bonded ones do; a stiffer cell anywhere costs; nu narrows what is free."""
-    rng = np.random.default_rng(9)
-    image, mesh = block((2.0, 3.0, 2.5), (3, 3, 3))
-    young = rng.uniform(1.0, 9.0, len(mesh.cells))
-    bonded = squeezed(mesh, image, young, 0.4).strain_energy
-    assert squeezed(mesh, image, young, 0.4, is_bonded=False).strain_energy < 0.99 * bonded
-    for cell in rng.choice(len(mesh.cells), 5, replace=False):
-        stiffer = young.copy()
-        stiffer[cell] *= 2.0
-        assert squeezed(mesh, image, stiffer, 0.4).strain_energy > bonded * (1.0 + 1e-6)
-    # Voigt and Reuss: between smooth plates the energy lies between those of equal stress and equal strain.
-    v = volumes(mesh.points, mesh.cells) / 15.0
-    smooth = squeezed(mesh, image, young, 0.0, is_bonded=False).strain_energy / (0.5 * 0.01**2 * 15.0)
-    assert 1.0 / (v / young).sum() < smooth < (v * young).sum()
-
-
 # Refinement
 
 
@@ -429,6 +361,7 @@ def refined(mesh, young):
     return fine, np.repeat(young, len(ends))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("n", [2, 3])
 def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
@@ -443,7 +376,7 @@ def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
     young = np.where(is_stiff, 20.0, 1.0)
     assert 0 < is_stiff.sum() < len(is_stiff)
     energies = []
-    for _ in range(6 if n == 2 else 4):
+    for _ in range(5 if n == 2 else 3):
         energies.append(squeezed(mesh, image, young, 0.3, is_bonded=is_bonded).strain_energy)
         mesh, young = refined(mesh, young)
     steps = -np.diff(energies)
@@ -455,16 +388,17 @@ def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
 # Solvers
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("sides", [(4.0, 5.0), (4.0, 3.0, 5.0)])
 def test_multigrid_and_factorisation_agree(sides, is_bonded):
     rng = np.random.default_rng(8)
-    image, mesh = block(sides, (40, 50) if len(sides) == 2 else (9, 7, 10))
+    image, mesh = block(sides, (36, 45) if len(sides) == 2 else (7, 6, 8))
     mesh = distorted(mesh, rng)
     young = np.exp(rng.uniform(0.0, np.log(1000.0), len(mesh.cells)))
     direct = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="direct")
     amg = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="amg")
-    assert len(amg.system.free) > 3000
+    assert len(amg.system.free) > 2000
     np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-12)
 
@@ -509,24 +443,21 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
 
 @given(seeds, dimensions)
 def test_faces_of_any_affine(seed, n):
-    """Oblique, sheared, flipped: every face is found, by index coordinates; the top lies higher along z (y in 2-D)."""
+    """Oblique, sheared, flipped: both faces are found, by index coordinates; the top lies higher along z (y in 2-D)."""
     rng = np.random.default_rng(seed)
     image = Image(np.zeros(rng.integers(2, 9, n)), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 4, n))
     mesh = lattice_mesh(image, blocks=blocks)
     index = image.to_index(mesh.points)
     directions = image.affine[:n, :n] / image.spacing
-    default = int(np.argmax(np.abs(directions[-1])))
-    for axis in range(n):
-        low, high = box_faces(image, mesh, axis)
-        ends = [np.flatnonzero(index[:, axis] < -0.499), np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501)]
-        assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
-        assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
-        shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
-        np.testing.assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
-        assert shift[n - 1 if axis == default else np.argmax(np.abs(shift))] > 0.0
-    for one, other in zip(box_faces(image, mesh), box_faces(image, mesh, default), strict=True):
-        np.testing.assert_array_equal(one, other)
+    axis = int(np.argmax(np.abs(directions[-1])))
+    low, high = box_faces(image, mesh)
+    ends = [np.flatnonzero(index[:, axis] < -0.499), np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501)]
+    assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
+    assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
+    shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
+    np.testing.assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
+    assert shift[-1] > 0.0
 
 
 def test_default_axis_is_the_one_along_z():
@@ -537,9 +468,6 @@ def test_default_axis_is_the_one_along_z():
     low, high = box_faces(image, mesh)
     assert mesh.points[low, 2] == pytest.approx(3.0 - 1.5 * 3.5)
     assert mesh.points[high, 2] == pytest.approx(3.0 + 1.5 * 0.5)
-    for axis, world in ((0, 1), (2, 0)):
-        low, high = box_faces(image, mesh, axis)
-        assert mesh.points[low, world].max() < mesh.points[high, world].min()
 
 
 def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
@@ -547,10 +475,9 @@ def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
     affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
     image = Image(np.zeros((3, 3, 3)), affine)
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
-    for axis in (None, 2):
-        low, high = box_faces(image, mesh, axis)
-        np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
-        np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
+    low, high = box_faces(image, mesh)
+    np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
+    np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
 
 
 def test_a_node_just_off_the_face_is_not_on_it():
@@ -760,11 +687,9 @@ def test_messages_of_box_faces():
         message_of(lambda: box_faces(image, PLATE))
         == "mesh and image: expected the same dimension, got a 2-D mesh and a 3-D image"
     )
-    assert message_of(lambda: box_faces(image, mesh, 3)) == "axis: expected one of 0 to 2 in 3-D, got 3"
-    assert message_of(lambda: box_faces(image, mesh, -1)) == "axis: expected one of 0 to 2 in 3-D, got -1"
     shrunk = Mesh(0.5 * mesh.points, mesh.cells)
     assert (
-        message_of(lambda: box_faces(image, shrunk, 1))
-        == "mesh: no node lies on the image's face at index 0.5 of axis 1, the mesh runs from -0.5 to 0; "
+        message_of(lambda: box_faces(image, shrunk))
+        == "mesh: no node lies on the image's face at index 0.5 of axis 2, the mesh runs from -0.5 to 0; "
         "it must fill the image's box: same image, crop and slice?"
     )

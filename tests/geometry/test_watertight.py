@@ -121,15 +121,6 @@ def test_a_whole_mesh_has_its_boundary_facets(mesh):
     assert (surface.n_parted, surface.largest_shift, n_pieces(surface)) == (0, 0.0, 1)
 
 
-def test_volume_and_area_far_from_the_origin():
-    points, cells = FIVE_TET_CUBE
-    assert volume_and_area(extract_surface(points, cells, range(5))) == pytest.approx((1.0, 6.0), rel=1e-14)
-    moved = points * 0.7 + 1e7 / 3.0
-    volume, area = volume_and_area(extract_surface(moved, cells, range(5)))
-    assert volume == pytest.approx(volumes(moved, cells).sum(), rel=1e-13)
-    assert area == pytest.approx(6.0 * 0.7**2, rel=1e-8)
-
-
 def test_mask_and_indices_in_any_order_mean_the_same():
     points, cells = grid((2, 2, 2))
     mask = np.arange(len(cells)) % 3 == 0
@@ -265,8 +256,7 @@ def test_any_cells_of_a_lattice(seed, kind, fraction):
 
 
 @pytest.mark.parametrize("kind", ["five-tet", "bcc"])
-@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.9])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("fraction", "seed"), [(0.1, 0), (0.9, 1)])
 def test_parted_sheets_do_not_cross(kind, fraction, seed):
     """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
     points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)
