@@ -290,17 +290,6 @@ def test_oblique_sheared_image_has_the_sphere_where_the_file_says(n, made):
     np.testing.assert_allclose(centroid, place, atol=0.01)
 
 
-@pytest.mark.parametrize("n", [2, 3])
-@pytest.mark.parametrize(("offset", "n_layers"), [(0.013, 2), (0.31, 1), (-3.47, 1)])
-def test_layer_of_a_tenth_of_a_voxel_is_not_lost(n, offset, n_layers, made):
-    """Across it lie exactly 2 midpoints of 20 per voxel wherever it is, so the mean is exact."""
-    normal = [0] * (n - 1) + [1]
-    layer = shape_text("layer", normal=normal, offset_mm=offset, thickness_mm=0.1, intensity=1010)
-    image = made((HEAD_2D if n == 2 else HEAD_3D) + layer).image(supersample=20)
-    assert image.data.mean(dtype=np.float64) == pytest.approx(10 + 1000 * 0.1 / 20, rel=1e-13)
-    assert np.count_nonzero(image.data != 10) == n_layers * 20 ** (n - 1)
-
-
 def test_blurred_edge_is_the_error_function_along_either_axis(made):
     """A half-plane blurred by sd 2 mm is 10 + 40 Phi(x / 2), along axes of 0.25 and of 0.5 mm.
 

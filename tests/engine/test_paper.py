@@ -11,7 +11,7 @@ from states import CASES, ball
 
 import tetopt
 from tetopt.energy.sampling import sampling_grid, to_ticks
-from tetopt.engine.loop import frozen_axes
+from tetopt.engine.loop import frozen_axes, side_ticks
 from tetopt.engine.paper import default_n_t, optimize_paper
 from tetopt.geometry.simplex import oriented, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, stars
@@ -70,8 +70,9 @@ def test_lloyd_reaches_a_stationary_mesh():
     n = image.ndim
     rng = np.random.default_rng(3)
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    ticks = to_ticks(image.to_index(mesh.points), sampling_grid(image, mesh.points))
-    frozen = frozen_axes(image, ticks, mesh.cells, sampling_grid(image, mesh.points), "slide")[:, 3 - n : 3]
+    grid = sampling_grid(image, mesh.points)
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    frozen = frozen_axes(ticks, boundary_facets(mesh.cells), side_ticks(grid), "slide", False)[:, 3 - n : 3]
     step = 0.12 * np.array(image.shape) / np.array(blocks)
     start = image.to_world(image.to_index(mesh.points) + ~frozen * rng.uniform(-step, step, mesh.points.shape))
     mesh = tetopt.Mesh(start, mesh.cells)

@@ -8,6 +8,7 @@ import tetopt
 from tetopt.contents.content import content, plain
 from tetopt.engine.requirements import checked, requested
 from tetopt.geometry.check import manifold_problems
+from tetopt.start.carve import part_of
 
 
 def violated(target, result, min_dihedral=0.0, start=None):
@@ -75,9 +76,8 @@ def test_a_mask_and_overlaps():
     last = result.history[-1]
     twice = result._replace(history=[last._replace(n_voxels=last.n_voxels + 2)])
     assert "2 voxels twice" in violated(target, twice)["overlap"]
-    half = result.mesh.cells[: len(result.mesh.cells) // 2]
-    used, cells = np.unique(half, return_inverse=True)
-    part = tetopt.Mesh(result.mesh.points[used], cells.reshape(half.shape))
+    n_cells = len(result.mesh.cells)
+    part = part_of(result.mesh, np.arange(n_cells) < n_cells // 2)
     n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
     halved = result._replace(mesh=part, history=[last._replace(n_voxels=n_voxels)])
     assert set(violated(target, halved)) - {"components", "manifold"} == {"mask"}
@@ -92,9 +92,8 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
     cells = result.mesh.cells
     n_shared = (cells[:, :, None] == cells[0]).any(axis=2).sum(axis=1)
     for chosen, names in ((1, ["components", "manifold"]), (0, ["components"])):
-        pair = cells[[0, np.flatnonzero(n_shared == chosen)[0]]]
-        used, rows = np.unique(pair, return_inverse=True)
-        part = tetopt.Mesh(result.mesh.points[used], rows.reshape(pair.shape))
+        pair = [0, np.flatnonzero(n_shared == chosen)[0]]
+        part = part_of(result.mesh, np.isin(np.arange(len(cells)), pair))
         n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
         row = result.history[-1]._replace(n_voxels=n_voxels)
         found = violated(target, result._replace(mesh=part, history=[row]))

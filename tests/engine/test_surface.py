@@ -13,6 +13,7 @@ from tetopt.contents.domain import levels, region_of
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
 from tetopt.engine.complex import build
 from tetopt.engine.fast import Run
+from tetopt.engine.loop import side_ticks
 from tetopt.engine.state import objective_of, sides_of
 from tetopt.engine.surface import level_at, put_on_surface
 from tetopt.geometry.check import manifold_problems
@@ -323,7 +324,7 @@ def test_put_on_surface():
     matrix = image.affine[:3, :3].copy()
     is_frozen = np.zeros((40, 4), dtype=bool)
     is_frozen[20:, 2] = is_frozen[:, 3] = True
-    objective, sides = objective_of(grid_, matrix, 3.0), sides_of(grid_, matrix, False, region_level)
+    objective, sides = objective_of(grid_, matrix, 3.0), sides_of(grid_, matrix, side_ticks(grid_), False, region_level)
     state = build(np.empty((0, 4), dtype=np.int64), ticks, is_frozen, objective, sides)
     normal = np.zeros((7, 3))
     reached = np.array([put_on_surface(normal, state, k) for k in range(40)])

@@ -28,6 +28,7 @@ from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.start.carve import part_of
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
@@ -261,21 +262,6 @@ def test_block_in_a_rigid_frame(n):
     np.testing.assert_allclose(u, field, atol=1e-13)
     modulus = 3.0 / (1.0 - nu**2) if n == 2 else 3.0 * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
     assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(0.5 * modulus * 1e-4 * 2.0**n, rel=1e-12)
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_pure_shear_of_one_block(n):
-    """Every node is held, so there is nothing to solve: 1/2 mu gamma^2 V."""
-    image, mesh = block((1.0, 2.0, 3.0)[:n], (1,) * n, None if n == 2 else "five-tet")
-    push = np.zeros(n)
-    push[0] = 0.1
-    low, high = box_faces(image, mesh)
-    if n == 2:  # its centre is free: hold it, too, where the shear takes it
-        mesh = Mesh(mesh.points[:4], [[low[0], low[1], high[1]], [low[0], high[1], high[0]]])
-    pressed = compression(mesh, 5.0, 0.25, fixed_nodes=high, pushed_nodes=low, displacement=push)
-    assert len(pressed.system.free) == 0
-    height, volume = mesh.points[:, -1].max(), volumes(mesh.points, mesh.cells).sum()
-    assert pressed.strain_energy == pytest.approx(0.5 * 2.0 * (0.1 / height) ** 2 * volume, rel=1e-13)
 
 
 # Laws of the compression
@@ -556,9 +542,7 @@ def test_a_tetrahedron_on_a_hinge_is_named():
 def test_smooth_plates_do_not_hold_two_columns():
     image, mesh = block((3.0, 1.0), (3, 1))
     centre = mesh.points[mesh.cells].mean(axis=1)[:, 0]
-    cells = mesh.cells[(centre < 1.0) | (centre > 2.0)]
-    used, cells = np.unique(cells, return_inverse=True)
-    columns = Mesh(mesh.points[used], cells.reshape(-1, 3))
+    columns = part_of(mesh, (centre < 1.0) | (centre > 2.0))
     squeezed(columns, image, 1.0, 0.3)
     with pytest.raises(InputError, match=r"can still turn or slide as a whole"):
         squeezed(columns, image, 1.0, 0.3, is_bonded=False)
@@ -567,9 +551,9 @@ def test_smooth_plates_do_not_hold_two_columns():
 # Messages
 
 
-def message_of(call):
+def message_of(call, *arguments):
     with pytest.raises(InputError) as error:
-        call()
+        call(*arguments)
     return str(error.value)
 
 
@@ -579,117 +563,63 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"young": [1.0, 0.0]},
-            "young: expected moduli above 0 kPa, got 1 others, the first 0 in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
-        (
-            {"young": [np.nan, -2.5]},
-            "young: expected moduli above 0 kPa, got 2 others, the first nan in cell 0, -2.5 in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
-        (
-            {"young": np.inf},
-            "young: expected moduli above 0 kPa, got 2 others, the first inf in cell 0, inf in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
+        ({"young": [1.0, 0.0]}, "above 0 kPa, got 1 others, the first 0 in cell 1; give empty space a small modulus"),
+        ({"young": [np.nan, -2.5]}, "got 2 others, the first nan in cell 0, -2.5 in cell 1"),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
-        ({"young": [[1.0, 1.0], [2.0, 1.0]]}, "young: expected one modulus for each of 2 cells, got shape (2, 2)"),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
         ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue take 0.45 to 0.49"),
-        ({"nu": -1.0}, "nu: expected -1 < nu < 0.5, got -1.0; for nearly incompressible tissue take 0.45 to 0.49"),
-        ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan; for nearly incompressible tissue take 0.45 to 0.49"),
+        ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan"),
         ({"fixed_nodes": []}, "fixed_nodes: expected at least one node, got none"),
-        ({"pushed_nodes": np.empty(0, int)}, "pushed_nodes: expected at least one node, got none"),
         ({"fixed_nodes": [2.0, 3.0]}, "fixed_nodes: expected a list of node numbers, got float64 of shape (2,)"),
-        ({"fixed_nodes": [[2, 3]]}, "fixed_nodes: expected a list of node numbers, got int64 of shape (1, 2)"),
         ({"pushed_nodes": [0, 4]}, "pushed_nodes: node numbers must lie in 0..3, got 0..4"),
-        ({"pushed_nodes": [-1, 0]}, "pushed_nodes: node numbers must lie in 0..3, got -1..0"),
-        (
-            {"pushed_nodes": [0, 1, 3, 2]},
-            "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]; "
-            "they cannot rest and move by the displacement",
-        ),
+        ({"pushed_nodes": [0, 1, 3, 2]}, "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]"),
         ({"displacement": [0.0, 0.0]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, 0.0]"),
-        ({"displacement": [0.0]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0]"),
         ({"displacement": [0.0, np.nan]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, nan]"),
         ({"method": "lu"}, "method: expected auto, direct or amg, got 'lu'"),
     ],
 )
 def test_messages_of_compression(changes, message):
-    arguments = {
-        "young": [1.0, 2.0], "nu": 0.3, "fixed_nodes": [2, 3], "pushed_nodes": [0], "displacement": [0.0, 0.1],
-    } | changes  # fmt: skip
-    young, nu = arguments.pop("young"), arguments.pop("nu")
-    assert message_of(lambda: compression(PLATE, young, nu, **arguments)) == message
+    options = {"fixed_nodes": [2, 3], "pushed_nodes": [0], "displacement": [0.0, 0.1], "young": [1.0, 2.0], "nu": 0.3}
+    options |= changes
+    young, nu = options.pop("young"), options.pop("nu")
+    assert message in message_of(lambda: compression(PLATE, young, nu, **options))
 
 
 def test_messages_of_meshes_that_are_not_held():
     points = np.vstack([PLATE.points, PLATE.points + 10.0, PLATE.points + 20.0])
     pieces = Mesh(points, np.vstack([PLATE.cells, PLATE.cells + 4, PLATE.cells + 8]))
-    assert (
-        message_of(
-            lambda: compression(pieces, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
-        )
-        == "mesh: 2 components have no node that is held, pushed or on a spring, the first has 2 cells around cell 2 "
-        "(node 4); hold it or take it out"
+    options = {"fixed_nodes": [2, 3], "pushed_nodes": [0, 1], "displacement": [0.0, 0.1]}
+    words = message_of(lambda: compression(pieces, 1.0, 0.3, **options))
+    assert words.startswith(
+        "mesh: 2 components have no node that is held, pushed or on a spring, the first has 2 cells"
     )
-    unused = Mesh(points, PLATE.cells)
-    assert (
-        message_of(
-            lambda: compression(unused, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
-        )
-        == "mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]; take them out of the mesh"
-    )
+    words = message_of(lambda: compression(Mesh(points, PLATE.cells), 1.0, 0.3, **options))
+    assert words.startswith("mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]")
     nothing = np.zeros((4, 2))
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
-        == "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
-        "hold:SET and spring:SET:K do"
-    )
+    assert "nothing holds it" in message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
-    assert (
-        message_of(
-            lambda: compression(
-                PLATE, 1.0, 0.3, fixed_nodes=[2], pushed_nodes=[1], displacement=[0.0, 0.1], is_bonded=False
-            )
-        )
-        == "mesh: 2 cells around cell 0 (node 0) can still turn or slide as a whole, they hang by too few nodes; "
-        "hold more nodes or keep the largest facet-connected set"
-    )
+    options |= {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
+    assert "can still turn or slide as a whole" in message_of(lambda: compression(PLATE, 1.0, 0.3, **options))
 
 
 def test_messages_of_constrained():
-    is_held = np.zeros((4, 2), dtype=bool)
+    is_held, values = np.zeros((4, 2), dtype=bool), np.zeros((4, 2))
     is_held[:2] = True
-    values = np.zeros((4, 2))
     values[3] = np.nan  # not prescribed, so it does not count
     constrained(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held, values))
-        == "prescribed: displacements must be finite, node 1 has [inf, 0.0]"
-    )
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held[:, 0], values))
-        == "is_prescribed: expected shape (4, 2), a row a node, got (4,)"
-    )
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held, values[:3]))
-        == "prescribed: expected shape (4, 2), a row a node, got (3, 2)"
-    )
+    for chosen, prescribed, words in (
+        (is_held, values, "prescribed: displacements must be finite, node 1 has [inf, 0.0]"),
+        (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), a row a node, got (4,)"),
+        (is_held, values[:3], "prescribed: expected shape (4, 2), a row a node, got (3, 2)"),
+    ):
+        assert words in message_of(lambda *given: constrained(PLATE, 1.0, 0.3, *given), chosen, prescribed)
 
 
 def test_messages_of_box_faces():
     image, mesh = block((1.0, 1.0, 1.0), (2, 2, 2))
-    assert (
-        message_of(lambda: box_faces(image, PLATE))
-        == "mesh and image: expected the same dimension, got a 2-D mesh and a 3-D image"
-    )
-    shrunk = Mesh(0.5 * mesh.points, mesh.cells)
-    assert (
-        message_of(lambda: box_faces(image, shrunk))
-        == "mesh: no node lies on the image's face at index 0.5 of axis 2, the mesh runs from -0.5 to 0; "
-        "it must fill the image's box: same image, crop and slice?"
+    assert "same dimension, got a 2-D mesh and a 3-D image" in message_of(box_faces, image, PLATE)
+    words = message_of(box_faces, image, Mesh(0.5 * mesh.points, mesh.cells))
+    assert words.startswith(
+        "mesh: no node lies on the image's face at index 0.5 of axis 2, the mesh runs from -0.5 to 0"
     )

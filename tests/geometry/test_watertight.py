@@ -1,7 +1,5 @@
 """Surfaces of sets of tetrahedra: closed and manifold whatever the set, around the same volume, crossing nothing."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -211,20 +209,6 @@ def test_cavities_that_share_a_node_part_into_themselves():
         assert (surface.n_parted, n_pieces(surface), euler(surface)) == (1, 3, 6)
         assert volume_and_area(surface)[0] > volumes(points, cells[is_chosen]).sum()
         assert n_crossings(surface) == 0
-
-
-def test_many_cells_that_share_one_node_all_come_apart():
-    """Every second octant around a node, and the narrowest moves farthest."""
-    corners = [np.diag(signs) for signs in product((1.0, -1.0), repeat=3) if np.prod(signs) > 0]
-    points = np.vstack(
-        [np.zeros((1, 3)), *[corner * scale for corner, scale in zip(corners, range(1, 5), strict=True)]]
-    )
-    cells = oriented(points, np.array([[0, 3 * k + 1, 3 * k + 2, 3 * k + 3] for k in range(4)]))
-    surface = extract_surface(points, cells, range(4))
-    assert_surface_of(surface, points, cells)
-    assert (surface.n_parted, n_pieces(surface)) == (1, 4)
-    near = np.sort(np.linalg.norm(surface.points, axis=1))[:4]
-    np.testing.assert_allclose(near, surface.largest_shift * np.arange(4) / 3.0, atol=1e-15)
 
 
 def test_the_shift_is_felt_in_float32_and_turns_no_cell():

@@ -257,21 +257,6 @@ def test_distances_are_pooled_by_area(n):
     assert row.distance_p95 == row.distance_max == 4.0
 
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_labels_that_meet(n):
-    """Three labels side by side, whose planes the mesh has: all is exact, without a label given to any cell."""
-    labels = np.zeros((9, 6, 6)[:n])
-    labels[3:6], labels[6:] = 5, 2
-    image = tetopt.Image(labels, shift_affine(np.random.default_rng(n), n, [2.0, 1.0, 0.7]))
-    rows = label_fidelity(image, blocky(image, (9, 3, 3)[:n]))
-    assert [row.label for row in rows] == [0, 2, 5]
-    for row in rows:
-        assert row.dice == 1.0
-        assert row.mesh_volume == pytest.approx(row.volume)
-        assert row.distance_p95 == pytest.approx(0.0, abs=1e-9)
-        assert (row.components, row.mesh_components) == (1, 1)
-
-
 def test_lost_label():
     """A voxel that no cell is small enough for."""
     labels = np.zeros((8, 8, 8))

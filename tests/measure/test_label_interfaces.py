@@ -21,6 +21,7 @@ from tetopt.measure.interfaces import (
     voxel_euler,
 )
 from tetopt.report.tables import label_differences
+from tetopt.start.carve import part_of
 
 
 def blocky(labels, affine=None):
@@ -73,13 +74,8 @@ def test_the_outside_is_no_label_but_is_around():
     labels[0, 1, 1] = labels[0, 2, 2] = 1
     image, mesh, of_cell = blocky(labels)
     only = of_cell == 1  # the two cubes alone: the outside is all around
-    alone = tetopt.Mesh(*compact(mesh.points, mesh.cells[only]))
+    alone = part_of(mesh, only)
     assert broken(label_interfaces(image, alone, np.ones(only.sum()))[1]) == (1, 1, 0, 0)
-
-
-def compact(points, cells):
-    used, cells = np.unique(cells, return_inverse=True)
-    return points[used], cells.reshape(-1, points.shape[1] + 1)
 
 
 @pytest.mark.parametrize(

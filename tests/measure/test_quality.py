@@ -104,23 +104,6 @@ def test_kinds_of_triangles():
     assert bad_kinds(points, cells).tolist() == ["cap", "needle", "good"]
 
 
-def test_the_bound_of_good_is_n_rho_of_0_3():
-    """Isosceles triangles of base 2, the height at the bound found by bisection, and crossed."""
-
-    def triangle(height):
-        return np.array([[-1.0, 0], [1, 0], [0, height]]), np.array([[0, 1, 2]])
-
-    low, high = 0.01, 1.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if 2 * rho(*triangle(middle))[0] < 0.3 else (low, middle)
-    assert bad_kinds(*triangle(low * (1 - 1e-9))).tolist() == ["cap"]
-    assert bad_kinds(*triangle(high * (1 + 1e-9))).tolist() == ["good"]
-    # r = h / (1 + l) and R = l^2 / 2 h with l^2 = 1 + h^2
-    length = sqrt(1 + high**2)
-    assert 2 * (high / (1 + length)) / (length**2 / (2 * high)) == pytest.approx(0.3)
-
-
 @given(seeds, st.sampled_from(sorted(BAD_TETS)))
 def test_kind_does_not_change_with_rotation_scale_reflection_or_order(seed, kind):
     rng = np.random.default_rng(seed)

@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-import tetopt
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.fem.solution import gauss_moduli, solve
 from tetopt.geometry.quadratic import gauss_rule
@@ -19,6 +18,7 @@ from tetopt.model.averages import (
 )
 from tetopt.model.build import build_model
 from tetopt.model.model import in_units
+from tetopt.start.carve import part_of
 
 
 def noise(shape, seed=0, affine=None):
@@ -115,9 +115,7 @@ def test_a_mapping_need_not_be_one_for_voxels_beside_the_mesh(average):
     """As of the air around an organ; within it everything is as with a mapping that holds everywhere."""
     image = noise((12, 12, 12))
     mesh = lattice_mesh(image, nodes=200)
-    inner = mesh.cells[(mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)]
-    used, cells = np.unique(inner, return_inverse=True)
-    part = tetopt.Mesh(mesh.points[used], cells.reshape(inner.shape))
+    part = part_of(mesh, mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)
     air = Image(np.where((cell_of_voxel(image, part) < 0) & (np.indices(image.shape)[0] > 8), -1000.0, image.data))
     moduli = element_young(air, part, lambda h: 1.0 + h, average, 2)
     np.testing.assert_array_equal(moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2))

@@ -1,6 +1,6 @@
 """Named sets: the box's faces by their anatomical names, interfaces, what is asked for in words."""
 
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from tetopt.errors import InputError
 from tetopt.fem.elasticity import box_faces
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.simplex import volumes
-from tetopt.mesh import Mesh
 from tetopt.model.file import sets_beside
 from tetopt.model.sets import (
     FACE_NAMES,
@@ -30,9 +29,9 @@ from tetopt.model.sets import (
     surviving_sets,
     with_requested,
 )
+from tetopt.start.carve import part_of
 
 NAMES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
-CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 
 
 def outward_areas(mesh, rows):
@@ -97,9 +96,7 @@ def test_an_oblique_box_is_known_by_its_affine_alone():
 def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     image = tetopt.Image(np.zeros((4, 4, 4)))
     mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
-    is_low = mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5
-    used, cells = np.unique(mesh.cells[is_low], return_inverse=True)
-    lower = Mesh(mesh.points[used], cells.reshape(-1, 4))
+    lower = part_of(mesh, mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5)
     sets = standard_sets(lower, box_of(image)).facets
     assert (lower.points[nodes_of(lower, sets["mask_surface"])][:, 2] > -0.5).all()
     np.testing.assert_allclose(outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0])
