@@ -99,6 +99,7 @@ def test_a_sphere_has_no_stairs(radius):
     assert abs(off.mean()) < 0.06
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("thickness", [2.0, 3.0, 4.0])
 def test_a_shell_keeps_its_thickness(thickness):
     centre, way = np.array([19.3, 20.1, 19.7]), directions()
@@ -158,6 +159,7 @@ def test_finer_voxels_fill_the_same_box(factors):
     np.testing.assert_allclose(fine.data, at @ [1.0, -2.0, 3.0], atol=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("spacing", "shape"), [((0.9, 0.9, 5.0), (80, 80, 16)), ((0.9, 5.0, 0.9), (80, 16, 80))])
 def test_thick_slices_do_not_show(spacing, shape):
     image = voxelised(spacing, shape)

@@ -384,6 +384,7 @@ def test_folder_inside_the_installed_package_comes_first(tmp_path, monkeypatch):
     assert phantom_folder() == (package / "phantoms").resolve()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_phantom(name):
     """It is named as its file, and on every voxel its labels and unblurred centres are those of h(x)."""

@@ -119,6 +119,7 @@ def test_moves_lower_the_energy(n):
             assert energy(changed) >= after - 1e-6
 
 
+@pytest.mark.full
 def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
     points, cells = box(3, 12, 4)

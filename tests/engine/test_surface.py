@@ -160,6 +160,7 @@ def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
     assert tetopt.check_mesh(kept.mesh) == []
 
 
+@pytest.mark.full
 def test_cells_that_overlap_across_a_gap_are_taken_out():
     """Two balls, one of them moved into the other by some voxels."""
     image, mask = shaped("pieces")

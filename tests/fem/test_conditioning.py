@@ -154,6 +154,7 @@ def test_count_is_that_of_the_textbook(n, blocks, is_bonded, rtol):
     assert abs(cg_iterations(equations.K_ff, equations.load, rtol) - expected) <= expected // 100
 
 
+@pytest.mark.full
 def test_count_of_easy_systems():
     """One step for a diagonal matrix, whatever is on it; three for three eigenvalues; none for no load."""
     b = np.random.default_rng(0).normal(size=300)

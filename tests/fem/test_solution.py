@@ -171,7 +171,7 @@ def test_each_kind_of_load_as_scikit_fem_has_it(kind, n, order):
     assert np.abs(expected).max() > 1e-3
 
 
-@pytest.mark.parametrize(("n", "order"), BOTH)
+@pytest.mark.parametrize(("n", "order"), [(2, 2), (3, 1)])
 def test_moduli_at_the_nodes_as_scikit_fem_has_them(n, order):
     """Linear within each cell. Both take the n + 1 points that are exact for degree 2."""
     mesh, sets, values = uneven(n)
@@ -293,6 +293,7 @@ def test_steps_and_superposition(n, order):
         assert np.abs(total).max() < 1e-9 * np.abs(list(solution.reactions.values())).max()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_work_of_what_is_moved(order):
     """Pushed faces: half of reaction times way; a free component has no reaction."""
@@ -384,6 +385,7 @@ def test_multigrid_of_order_2_is_symmetric_and_positive(nu):
     assert np.linalg.eigvals(dense @ system.K_ff.toarray()).real.min() > 0.02
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_multigrid_and_factorisation_agree_with_order_2(n):
     mesh, sets = bar(n, 12 if n == 2 else 4)
@@ -411,7 +413,7 @@ def test_conditioning_of_order_2(method):
 # Fields
 
 
-@pytest.mark.parametrize(("n", "order"), BOTH)
+@pytest.mark.parametrize(("n", "order"), [(2, 1), (3, 2)])
 def test_fields(n, order):
     """Names, shapes and what they are: means of cells, and means by volume around nodes."""
     mesh, sets, values = uneven(n)

@@ -148,7 +148,7 @@ def test_steps_of_the_iteration():
 
 @kernel
 @pytest.mark.parametrize(("shape", "linear"), SHAPES)
-@pytest.mark.parametrize("nu", [-0.3, 0.3, 0.45])
+@pytest.mark.parametrize("nu", [-0.3, 0.45])
 def test_solution_is_the_direct_one(shape, linear, nu):
     """To 1e-8 of the largest displacement, for every shape; the plates keep theirs."""
     grid, K, is_free = grid_and_oracle(shape, linear, nu)

@@ -40,6 +40,7 @@ def assert_same(mesh, expected):
 
 
 # Bytes of a read, and voxels of a piece, so that boxes are cut along one axis, and along both.
+@pytest.mark.full
 @pytest.mark.parametrize("most", [(3_000, 700), (50_000, 20_000)])
 @pytest.mark.parametrize(
     ("shape", "dtype", "affine", "chunks"),
