@@ -123,6 +123,7 @@ def test_clipped(kind):
     assert fidelity.distance_mean < 0.25
 
 
+@pytest.mark.full
 def test_wanted_nodes_within_a_mask():
     image, mask = shaped("ball")
     for nodes in (200, 600, 1500):

@@ -130,6 +130,7 @@ def test_shape_curvature(n, is_graded):
         np.testing.assert_allclose(got, expected[3 - n :, 3 - n :], rtol=1e-5, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.full
 def test_image_curvature_at_a_step():
     """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform image it does not."""
     data = np.where(np.arange(40)[:, None, None] > 20, 100.0, 20.0) * np.ones((40, 36, 32))
@@ -280,6 +281,7 @@ def test_mappings(name, k_D, boundary):
         assert dihedral_angles(result.mesh.points, result.mesh.cells).min() >= 12.0 - 1e-6
 
 
+@pytest.mark.full
 def test_reaches_lower_than_the_paper():
     """With the paper's own energy (p = 1, no minimum angle) the same iterations end lower."""
     image, blocks = CASES["oblique"]

@@ -93,6 +93,7 @@ def test_what_is_not_manifold_as_the_twin(n):
         assert len(bad) > 1
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_moves_lower_the_energy(n):
     """By cells of random content: each time cells settle it falls, and no move of one cell is left that lowers it."""

@@ -389,6 +389,7 @@ def test_multigrid_and_factorisation_agree(sides, is_bonded):
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 def test_a_multigrid_cycle_is_symmetric_and_positive(is_bonded):
     """What conjugate gradients need of a preconditioner."""

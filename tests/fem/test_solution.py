@@ -307,6 +307,7 @@ def test_the_work_of_what_is_moved(order):
     assert solution.spring_energy == 0.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", [1, 2])
 def test_it_is_the_compression(order):
     mesh, sets, values = uneven(3)
