@@ -93,6 +93,20 @@ def E_G_as_printed(points, cells):
     return float(sum(dot(p, p) * v for p, v in zip(points, star_volume, strict=True)) / (n + 1) - integral)
 
 
+def E_G_gradient(points, cells):
+    """By the complex step, which is exact: E_G is a polynomial of the coordinates."""
+    n = points.shape[1]
+    gradient = np.zeros_like(points)
+    for node, axis in np.ndindex(points.shape):
+        x = points.astype(complex)
+        x[node, axis] += 1e-30j
+        corners = x[cells[(cells == node).any(axis=1)]]
+        v = np.linalg.det(corners[:, 1:] - corners[:, :1]) / factorial(n)
+        squares = sum(((corners[:, i] - corners[:, k]) ** 2).sum(axis=1) for i, k in combinations(range(n + 1), 2))
+        gradient[node, axis] = (v * squares).sum().imag / 1e-30 / ((n + 1) * (n + 2))
+    return gradient
+
+
 def volume_and_E_G(corners):
     """Unsigned volume and E_G of one cell, (n+1) rows of n floats; exact up to the last rounding."""
     corners = exactly(corners)

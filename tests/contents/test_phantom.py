@@ -132,19 +132,6 @@ def test_later_shapes_are_painted_over_earlier(made):
     assert made(HEAD_2D + small + big).image().data[10, 10] == 50
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_labels_and_intensities_belong_to_the_same_shape(name):
-    phantom = load_phantom(name)
-    values = {phantom.background_label: phantom.background_intensity}
-    values |= {shape.label: shape.intensity for shape in phantom.shapes}
-    assert len(values) == 1 + len(phantom.shapes), "the labels of a phantom of ours are all different"
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20_000, phantom.ndim)) * phantom.size_mm
-    labels = phantom.labels(points)
-    assert labels.dtype == np.int64
-    assert set(labels.tolist()) == set(values)
-    assert phantom.intensity(points).tolist() == [values[label] for label in labels.tolist()]
-
-
 @pytest.mark.parametrize("shape", [(2,), (7, 2), (3, 4, 2), (0, 2)])
 def test_points_keep_their_leading_shape(shape):
     phantom = load_phantom("disc_2d")
@@ -198,12 +185,6 @@ def test_signed_distance_of_box_and_layer_is_the_distance(kind, n, made):
     assert signed_distance(corner, [4.0, 6.0]) == 5.0
 
 
-def test_signed_distance_does_not_depend_on_the_batch(made):
-    """A point on a surface falls on one side, alone or among many."""
-    shape, surface, _ = random_shape("ellipsoid", 3, np.random.default_rng(4), made)
-    assert [float(signed_distance(shape, x)) for x in surface] == signed_distance(shape, surface).tolist()
-
-
 # --- voxels
 
 
@@ -230,17 +211,6 @@ def test_voxels_are_means_of_all_their_sub_voxels(name, voxel, supersample):
     for axis, size in enumerate(image.shape):
         blocks = np.stack(np.split(blocks, size, axis), axis).mean(axis + 1)
     np.testing.assert_allclose(image.data, blocks, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_voxels_that_no_surface_cuts_are_exact(name):
-    """Every value lies between the intensities of the file, and most are one of them to the last bit."""
-    phantom = load_phantom(name)
-    image = phantom.image()
-    values = [phantom.background_intensity, *(shape.intensity for shape in phantom.shapes)]
-    assert min(values) <= image.data.min()
-    assert image.data.max() <= max(values)
-    assert np.isin(image.data, values).mean() > 0.7
 
 
 def test_a_whole_voxel_is_exact_even_when_its_intensity_is_no_binary_fraction(made):
@@ -275,6 +245,7 @@ def test_a_midpoint_on_the_surface_is_inside(made):
 COUNTING_ERROR = {2: math.sqrt(9.034 / (2 * math.pi**2)), 3: math.sqrt(16.532 / (2 * math.pi**2))}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_rendered_volume_converges_to_the_ball(n, made):
     """The sum over voxels is background + contrast * volume, up to the error of counting midpoints.
@@ -283,7 +254,7 @@ def test_rendered_volume_converges_to_the_ball(n, made):
     is 1.5 in the plane and 2 in space, and c is the theory's, `COUNTING_ERROR`, to 15 percent for 200 balls.
     """
     rng = np.random.default_rng(5)
-    spacings = np.array([1.0, 1 / 2, 1 / 4, 1 / 8])
+    spacings = np.array([1.0, 1 / 2, 1 / 4])
     errors = np.zeros((len(spacings), 200))
     for j in range(200):
         center, r = rng.uniform(-1, 1, n).tolist(), float(rng.uniform(5, 6))
@@ -296,18 +267,7 @@ def test_rendered_volume_converges_to_the_ball(n, made):
     rms = np.sqrt((errors**2).mean(axis=1))
     theory = COUNTING_ERROR[n] * spacings ** ((n + 1) / 2) * 5.5 ** ((n - 1) / 2)
     np.testing.assert_allclose(rms, theory, rtol=0.15)
-    assert np.polyfit(np.log(spacings), np.log(rms), 1)[0] == pytest.approx((n + 1) / 2, abs=0.1)
-
-
-def test_volume_fraction_of_the_shipped_sphere():
-    """The default 4 x 4 x 4 sub-voxels give the volume to four times the usual error of counting, 1.4e-4.
-
-    Centred on a corner of the grid, with a radius that is a whole number of sub-voxels, it is a bad case: the
-    error is 3.1 times the usual.
-    """
-    image = load_phantom("sphere").image()
-    volume = (image.data.sum(dtype=np.float64) - 20 * 64**3) / 80
-    assert volume == pytest.approx(4 / 3 * math.pi * 20**3, abs=4 * COUNTING_ERROR[3] * 0.25**2 * 20)
+    assert np.polyfit(np.log(spacings), np.log(rms), 1)[0] == pytest.approx((n + 1) / 2, abs=0.15)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -328,33 +288,6 @@ def test_oblique_sheared_image_has_the_sphere_where_the_file_says(n, made):
     index = np.stack(np.indices(image.shape), axis=-1)
     centroid = (weight[..., None] * image.to_world(index)).sum(axis=tuple(range(n))) / weight.sum()
     np.testing.assert_allclose(centroid, place, atol=0.01)
-
-
-@pytest.mark.parametrize("n", [2, 3])
-@pytest.mark.parametrize(("offset", "n_layers"), [(0.013, 2), (0.31, 1), (-3.47, 1)])
-def test_layer_of_a_tenth_of_a_voxel_is_not_lost(n, offset, n_layers, made):
-    """Across it lie exactly 2 midpoints of 20 per voxel wherever it is, so the mean is exact."""
-    normal = [0] * (n - 1) + [1]
-    layer = shape_text("layer", normal=normal, offset_mm=offset, thickness_mm=0.1, intensity=1010)
-    image = made((HEAD_2D if n == 2 else HEAD_3D) + layer).image(supersample=20)
-    assert image.data.mean(dtype=np.float64) == pytest.approx(10 + 1000 * 0.1 / 20, rel=1e-13)
-    assert np.count_nonzero(image.data != 10) == n_layers * 20 ** (n - 1)
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_oblique_layer_of_a_tenth_of_a_voxel_has_its_volume(n, made):
-    """It leaves by the side walls: its volume is thickness * base / cosine of the tilt, here to 1 percent."""
-    normal = np.array([0.13, 0.21, 1.0])[3 - n :]
-    layer = shape_text("layer", normal=normal.tolist(), offset_mm=0.3, thickness_mm=0.1, intensity=1010)
-    image = made((HEAD_2D if n == 2 else HEAD_3D) + layer).image(supersample=10)
-    cosine = normal[-1] / np.linalg.norm(normal)
-    assert image.data.mean(dtype=np.float64) - 10 == pytest.approx(1000 * 0.1 / 20 / cosine, rel=0.01)
-
-
-@pytest.mark.parametrize("name", ["fig2_2d", "layered_oblique"])
-def test_blur_of_nothing_and_noise_of_nothing_change_nothing(name):
-    phantom = load_phantom(name)
-    np.testing.assert_array_equal(phantom.image(blur_mm=0, noise_sd=0, seed=9).data, phantom.image().data)
 
 
 def test_blurred_edge_is_the_error_function_along_either_axis(made):
@@ -387,7 +320,7 @@ def test_turning_the_world_leaves_the_voxels_alone(n, made):
     np.testing.assert_allclose(image.data, still.data, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", ["sphere", "layered_oblique", "prostate_2d"])
 def test_blur_keeps_the_mean(name):
     """To rounding where nothing but background is near the border; else the border's continuation counts."""
     phantom = load_phantom(name)
@@ -436,13 +369,6 @@ def test_memory_stays_small():
     assert peak < 100e6
 
 
-def test_arrays_are_read_only():
-    phantom = load_phantom("layered_oblique")
-    arrays = [phantom.size_mm, phantom.voxel_mm, phantom.center_mm, phantom.axes]
-    arrays += [a for shape in phantom.shapes for a in (shape.center, shape.frame, shape.half)]
-    assert not any(array.flags.writeable for array in arrays)
-
-
 # --- the folder
 
 
@@ -458,6 +384,7 @@ def test_folder_inside_the_installed_package_comes_first(tmp_path, monkeypatch):
     assert phantom_folder() == (package / "phantoms").resolve()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_phantom(name):
     """It is named as its file, and on every voxel its labels and unblurred centres are those of h(x)."""
@@ -475,11 +402,6 @@ def test_shipped_phantom(name):
     assert (values[0] > 0) == (name != "ellipsoids_brain")
 
 
-def test_shipped_by_name_and_by_path_are_the_same():
-    for path in (phantom_folder() / "sphere.toml", str(phantom_folder() / "sphere.toml")):
-        np.testing.assert_array_equal(load_phantom(path).image(4).data, load_phantom("sphere").image(4).data)
-
-
 # --- messages
 
 
@@ -491,39 +413,25 @@ def test_shipped_by_name_and_by_path_are_the_same():
         ('name = "test"\nd', 'd = "x"\nd', "missing name; "),
         ("voxel_mm = 1", "voxel_mm = 1\nvoxels = 3", "unknown 'voxels'; the keys known here are name, desc"),
         ('"test"', "3", "name: expected a text in quotes, got 3"),
-        ('"of a test"', '" "', "description: expected a text in quotes, got ' '"),
         ("[20, 20]", "[20]", "size_mm: expected a list of 2 or 3 numbers, one per axis, got \\[20\\]"),
-        ("[20, 20]", "20", "size_mm: expected a list of 2 or 3 numbers, one per axis, got 20"),
-        ("[20, 20]", "[20, true]", "size_mm: expected a list of 2 numbers, all finite, got \\[20, True\\]"),
         ("[20, 20]", "[20, 0]", "size_mm: expected lengths above 0 mm, got \\[20.0, 0.0\\]"),
         ("voxel_mm = 1", "voxel_mm = 0", "voxel_mm: expected lengths above 0 mm, got \\[0.0, 0.0\\]"),
-        ("voxel_mm = 1", "voxel_mm = nan", "voxel_mm: expected a number or a list of 2, all finite, got nan"),
-        ("voxel_mm = 1", "voxel_mm = [1, 2, 3]", "voxel_mm: expected a number or a list of 2, all finite"),
         ("voxel_mm = 1", "voxel_mm = [1, 21]", "voxel_mm: expected voxels no larger than the box of"),
         ("voxel_mm = 1", "voxel_mm = 1\ncenter_mm = [0]", "center_mm: expected a list of 2 numbers, all"),
-        ("voxel_mm = 1", "voxel_mm = 1\nblur_mm = -1", "blur_mm: expected a finite number, 0 or more, got"),
         ("voxel_mm = 1", 'voxel_mm = 1\nnoise_sd = "1"', "noise_sd: expected a finite number, 0 or more"),
         ("voxel_mm = 1", "voxel_mm = 1\nseed = 1.5", "seed: expected an integer from 0 to 2147483647, got"),
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0]]", "axes: expected 2 rows, the directions of the"),
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0], [1]]", "axes: row 2: expected a list of 2 numbers"),
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 1], [2, 2]]", "axes: the directions .* do not span 2-D"),
-        ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 1], [0, 0]]", "axes: the directions .* do not span 2-D"),
         ("{ intensity = 10, label = 0 }", "10", "background: expected a table, got 10; write for example"),
         ("{ intensity = 10, label = 0 }", "{ label = 0 }", "background: missing intensity; every one of"),
-        ("{ intensity = 10, label", "{ intensity = 10, lable", "background: unknown 'lable'; the keys"),
-        ("intensity = 10", "intensity = inf", "background: intensity: expected a finite number, got inf"),
         ("label = 0", "label = -1", "background: label: expected an integer from 0 to 2147483647, got -1"),
         ("[[shape]]", "[shape]", "shape: expected tables, got .*; begin each shape with \\[\\[shape\\]\\]"),
         ('"ellipsoid"', '"sphere"', "shape 1: kind: expected one of ellipsoid, box, layer, got 'sphere'"),
-        ('kind = "ellipsoid"', "", "shape 1: kind: expected one of ellipsoid, box, layer, got None"),
         ('kind = "ellipsoid"', 'kind = "layer"', "shape 1: layer: missing normal, offset_mm, thickness_mm;"),
         ("radii_mm", "radius_mm", "shape 1: ellipsoid: missing radii_mm; every one of kind, intensity"),
         ("label = 1", "label = 1\ncolor = 1", "shape 1: ellipsoid: unknown 'color'; the keys known here"),
-        ("label = 1", "label = true", "shape 1: label: expected an integer from 0 to 2147483647, got True"),
-        ("label = 1", "label = 1\nname = 7", "shape 1: name: expected a text in quotes, got 7"),
-        ("= 50", "= []", "shape 1: intensity: expected a finite number, got \\[\\]"),
         ("[0, 0]", "[0, 0, 0]", "shape 1: center_mm: expected a list of 2 numbers, all finite, got \\[0"),
-        ("radii_mm = 5", "radii_mm = [5]", "shape 1: radii_mm: expected a number or a list of 2, all"),
         ("radii_mm = 5", "radii_mm = -5", "shape 1: radii_mm: expected lengths above 0 mm, got \\[-5.0"),
         ("= 1\n", "= 1\nrotation_deg = [1, 2, 3]\n", "shape 1: rotation_deg: expected a finite number, got"),
         ("radii_mm = 5", 'name = "a\\nb"\nradii_mm = 0', "shape 1 'a.nb': radii_mm: expected lengths above"),
@@ -544,9 +452,7 @@ def test_messages_of_a_file(old, new, message, made, tmp_path):
     ("values", "message"),
     [
         ({"normal": [0, 0], "offset_mm": 0, "thickness_mm": 1}, "normal: expected a direction, got all"),
-        ({"normal": [1], "offset_mm": 0, "thickness_mm": 1}, "normal: expected a list of 2 numbers, all"),
         ({"normal": [0, 1], "offset_mm": 0, "thickness_mm": 0}, "thickness_mm: expected lengths above 0"),
-        ({"normal": [0, 1], "offset_mm": 0, "thickness_mm": [1]}, "thickness_mm: expected a finite number"),
         ({"normal": [0, 1], "offset_mm": "nan", "thickness_mm": 1}, "offset_mm: expected a finite number"),
         (
             {"normal": [0, 1], "offset_mm": 0, "thickness_mm": 1, "rotation_deg": 5},
@@ -585,18 +491,13 @@ def test_messages_of_a_file_that_cannot_be_read(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"voxel_mm": 0}, "voxel_mm: expected lengths above 0 mm, got \\[0.0, 0.0, 0.0\\]"),
         ({"voxel_mm": "1"}, "voxel_mm: expected a number or a list of 3, all finite, got '1'"),
-        ({"voxel_mm": [1, 1]}, "voxel_mm: expected a number or a list of 3, all finite, got \\[1, 1\\]"),
         ({"voxel_mm": 65}, "voxel_mm: expected voxels no larger than the box of \\[64.0, 64.0, 64.0\\] mm"),
         ({"voxel_mm": 0.001}, "voxel_mm: expected at most 2\\*\\*36 voxels, got 64000 x 64000 x 64000 of"),
         ({"voxel_mm": 1e-308}, "voxel_mm: expected at most 2\\*\\*36 voxels, got inf x inf x inf of"),
         ({"blur_mm": -1}, "blur_mm: expected a finite number, 0 or more, got -1"),
-        ({"noise_sd": math.nan}, "noise_sd: expected a finite number, 0 or more, got nan"),
         ({"seed": -1}, "seed: expected an integer from 0 to 2147483647, got -1"),
         ({"supersample": 0}, "supersample: expected an integer from 1 to 64, got 0"),
-        ({"supersample": 65}, "supersample: expected an integer from 1 to 64, got 65"),
-        ({"supersample": 2.0}, "supersample: expected an integer from 1 to 64, got 2.0"),
     ],
 )
 def test_messages_of_rendering(options, message):
@@ -608,9 +509,7 @@ def test_messages_of_rendering(options, message):
     ("points", "message"),
     [
         ([0.0, 0.0], "points: expected shape \\(..., 3\\), got \\(2,\\); give 3 world coordinates in mm"),
-        (1.0, "points: expected shape \\(..., 3\\), got \\(\\)"),
         ([0.0, 0.0, math.nan], "points: some are NaN or infinite; leave those out"),
-        (["a", "b", "c"], "points: expected numbers of shape \\(..., 3\\), got \\['a', 'b', 'c'\\]"),
     ],
 )
 def test_messages_of_points(points, message):

@@ -164,17 +164,6 @@ def test_splitting_cells_does_not_raise_E_D(seed, n):
     assert (split <= whole * (1 + 1e-9) + 1e-9 * image.voxel_volume).all()
 
 
-@pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
-@kernel
-def test_E_D_falls_with_the_block_and_is_0_with_one_voxel_a_cell(n, kind):
-    """With a block a voxel no cell holds two centres: the mesh is the image."""
-    rng = np.random.default_rng(0)
-    image = Image(rng.normal(100.0, 10.0, (8, 4, 4)[:n]))
-    energies = [E_D(image, lattice_mesh(image, kind, blocks=tuple(b // s for b in image.shape))) for s in (4, 2, 1)]
-    assert energies[0] > 1.05 * energies[1] > 0
-    assert energies[2] == pytest.approx(0, abs=1e-9)
-
-
 @given(seeds, dimensions)
 @kernel
 def test_E_D_scales_with_contrast_squared_and_volume(seed, n):

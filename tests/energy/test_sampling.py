@@ -105,32 +105,10 @@ def test_owners_on_random_meshes_are_the_twin_s(seed, n):
     np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
-@pytest.mark.parametrize(
-    ("shape", "kind", "blocks"),
-    [
-        ((6, 6), "criss-cross", (3, 3)),
-        ((7, 5), "criss-cross", (2, 5)),
-        ((4, 4, 4), "bcc", (2, 2, 2)),
-        ((4, 4, 4), "five-tet", (2, 2, 2)),
-        ((5, 3, 4), "bcc", (1, 1, 2)),
-        ((3, 3, 3), "bcc", (3, 3, 3)),
-        ((3, 2, 3), "five-tet", (3, 2, 3)),
-        ((2, 2, 2), "bcc", (3, 3, 3)),  # blocks under a voxel
-    ],
-)
-def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
-    image = Image(np.zeros(shape))
-    mesh = lattice_mesh(image, kind, blocks=blocks)
-    owner = cell_of_voxel(image, mesh)
-    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
-    assert (owner >= 0).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("shape", [(3, 90), (90, 4), (40, 50), (14, 12, 16), (2, 3, 90)])
-def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape, seed):
+def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape):
     """Nodes on centres far apart: lines and planes of slopes like 7/49 pass through other centres."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2)
     image = Image(np.zeros(shape))
     mesh = placed(image, *split_box(rng, shape, 5 if len(shape) == 3 else 12, 1))
     np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
@@ -227,23 +205,6 @@ def test_counts_and_sums_are_the_image_s(seed, n, is_snapped):
     assert squares == pytest.approx((data**2).sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
-@pytest.mark.parametrize("seed", range(3))
-def test_counts_on_jittered_lattices(n, kind, seed):
-    """Hundreds of cells, oblique voxels of unequal edges, interior nodes moved by up to a tenth of a block."""
-    rng = np.random.default_rng(seed)
-    shape = tuple(int(s * SMALL) for s in (40, 36, 50))[:n] if n == 2 else tuple(int(s * SMALL) for s in (20, 18, 26))
-    blocks = (6, 5) if n == 2 else (3, 3, 4)
-    image = random_image(rng, shape, random_affine(rng, n))
-    mesh = lattice_mesh(image, kind, blocks=blocks)
-    index = image.to_index(mesh.points)
-    is_inside = ((index > -0.4) & (index < np.array(shape) - 0.6)).all(axis=1, keepdims=True)
-    index = index + is_inside * rng.uniform(-0.1, 0.1, index.shape) * np.array(shape) / blocks
-    mesh = placed(image, index, mesh.cells)
-    assert cell_moments(image, mesh).n_voxels.sum() == image.data.size
-    assert (cell_of_voxel(image, mesh) >= 0).all()
-
-
 def test_counts_with_more_cells_than_voxels():
     """Cells far below a voxel, thin ones among them."""
     rng = np.random.default_rng(0)
@@ -279,12 +240,11 @@ def test_moment_sums_are_the_twin_s(seed, n, is_snapped):
     np.testing.assert_allclose(sums, twin, rtol=1e-12, atol=1e-9)
 
 
-@pytest.mark.parametrize("high", [1, 181, 46340, 92681, 92682, 131072, 3_000_001, 2.0**40, 0.5, 1e-30])
-@pytest.mark.parametrize("n", [2, 3])
-def test_moment_sums_of_all_sizes_of_numbers(high, n):
+@pytest.mark.parametrize("high", [1, 46340, 92681, 92682, 3_000_001, 2.0**40, 0.5, 1e-30])
+def test_moment_sums_of_all_sizes_of_numbers(high):
     """0 and `high` in random places: whole numbers whose sums of squares fit 31 bits, and not, and fractions."""
     rng = np.random.default_rng(0)
-    shape = (3, 4, 5)[:n]
+    shape = (3, 4, 5)
     image = Image(np.where(rng.random(shape) < 0.5, 0, high))
     mesh = placed(image, *split_box(rng, shape, 4))
     grid = sampling_grid(image, mesh.points)
@@ -326,22 +286,6 @@ def test_variance_of_a_small_contrast_on_a_large_mean(offset, contrast):
     assert cell_moments(image, mesh).variance == pytest.approx(exact, rel=1e-6, abs=0)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_float32_and_float64_give_the_same(dtype):
-    """In float32 values are stored, not summed."""
-    rng = np.random.default_rng(7)
-    data = rng.integers(0, 4096, (9, 9, 9)) / 16
-    image = Image(data.astype(dtype))
-    stored = Image(data)
-    object.__setattr__(stored, "data", data.astype(dtype))
-    mesh = placed(image, *split_box(rng, data.shape, 6))
-    owner = cell_of_voxel(stored, mesh)
-    for cell, (count, mean, variance) in enumerate(zip(*cell_moments(stored, mesh), strict=True)):
-        if count:
-            assert mean == pytest.approx(data[owner == cell].mean(), rel=1e-13)
-            assert variance == pytest.approx(data[owner == cell].var(), rel=1e-11, abs=1e-10)
-
-
 # Cells without a voxel, and voxels without a cell
 
 
@@ -356,7 +300,7 @@ def test_a_cell_without_voxel_centre_takes_the_nearest_voxel_s_value():
 
 
 @pytest.mark.parametrize("n", [2, 3])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_cells_without_voxel_centres_have_the_centroid_s_value(seed, n):
     """And a variance of 0 to the last bit, in images whose sums of squares round."""
     rng = np.random.default_rng(seed)
@@ -396,16 +340,6 @@ def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
         low, high = shift[axis] - 0.5, shift[axis] - 0.5 + (5, 4, 4)[axis]
         is_inside &= (centres >= low) & (centres < high)
     np.testing.assert_array_equal(owner >= 0, is_inside)
-
-
-def test_a_mesh_beside_the_image_holds_nothing():
-    image = Image(np.arange(27.0).reshape(3, 3, 3))
-    mesh = lattice_mesh(image, blocks=(1, 1, 1))
-    moved = Mesh(mesh.points + np.array([10.0, 0, 0]), mesh.cells)
-    moments = cell_moments(image, moved)
-    assert moments.n_voxels.tolist() == [0] * 12
-    assert (moments.mean >= 18).all()  # the values at the border i = 2
-    assert (cell_of_voxel(image, moved) == -1).all()
 
 
 # Laws
@@ -451,16 +385,6 @@ def test_the_world_s_frame_does_not_matter(seed, n):
     np.testing.assert_array_equal(
         cell_of_voxel(moved, Mesh(points, oriented(points, mesh.cells))), cell_of_voxel(image, mesh)
     )
-
-
-def test_a_flip_of_the_array_flips_the_owners_of_a_generic_mesh():
-    rng = np.random.default_rng(4)
-    image = random_image(rng, (7, 6, 5))
-    mesh = placed(image, *delaunay_box(rng, image.shape, 10))
-    flip = np.diag([-1.0, 1, 1, 1])
-    flip[0, 3] = 6
-    flipped = Image(image.data[::-1], flip)
-    np.testing.assert_array_equal(cell_of_voxel(flipped, mesh)[::-1], cell_of_voxel(image, mesh))
 
 
 @pytest.mark.skipif(not naive.IS_COMPILED, reason="NUMBA_DISABLE_JIT is set: no threads")

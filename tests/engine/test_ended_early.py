@@ -14,6 +14,7 @@ from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import save_volume
 from tetopt.report.summary import fidelity
 
+pytestmark = pytest.mark.full
 SPREAD = 3  # of the asks of a run, those at which the quick test stops
 
 

@@ -1,5 +1,6 @@
 """The fast engine: its gradients, its moves, its minimum angle, and its laws on phantoms."""
 
+import naive
 import numba
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from states import CASES, OBLIQUE, Engine, assumed_case, ball, random_case
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.energy.discretization import cell_E_D
-from tetopt.energy.geometric import E_G_gradient, cell_E_G
+from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import from_ticks
 from tetopt.engine import flips
 from tetopt.engine.complex import build, cell_squares, cosine_up_to_limit, energies, node_stars, remeasure
@@ -37,10 +38,10 @@ def smooth_image(shape, affine=None):
 def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
     """The bound by the shape measure never lets one through that is below, and lets most regular ones through."""
     rng = np.random.default_rng(4)
-    corners = rng.normal(size=(20_000, 4, 3))
-    corners[:10_000] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:10_000]
-    corners[5_000:7_500, :, 0] *= 0.2  # flat ones
-    half = np.radians(rng.uniform(1.0, 70.0, 5_000)) / 2.0  # and the very ones that the bound is sharp for
+    corners = rng.normal(size=(4_000, 4, 3))
+    corners[:2_000] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:2_000]
+    corners[1_000:1_500, :, 0] *= 0.2  # flat ones
+    half = np.radians(rng.uniform(1.0, 70.0, 1_000)) / 2.0  # and the very ones that the bound is sharp for
     edge = 0.5 * np.sqrt(1.0 + np.sin(half) ** 2)
     zero = np.zeros_like(half)
     ends = np.stack([np.stack([zero, zero, s * edge], 1) for s in (1, -1)], 1)
@@ -56,7 +57,7 @@ def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
         assert (angles[cosines >= cosine] >= min_dihedral * (1 - 1e-12)).all()
         np.testing.assert_allclose(cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9)
     objective = objective._replace(angle_limit=-0.97, safe=angle_limit_of(12.0)[1])
-    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:2000]]) == -0.97).mean() > 0.5
+    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:800]]) == -0.97).mean() > 0.5
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -96,7 +97,7 @@ def test_shape_gradient(n, power):
                 ends.append(energy(moved))
             assert shape[node, 3 - n + d] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5, abs=1e-9)
     if power == 1.0:
-        expected = engine.objective.geometry * E_G_gradient(mesh.points, mesh.cells)
+        expected = engine.objective.geometry * naive.E_G_gradient(mesh.points, mesh.cells)
         np.testing.assert_allclose(shape[:, 3 - n :], expected, rtol=1e-6, atol=1e-12)
 
 
@@ -129,6 +130,7 @@ def test_shape_curvature(n, is_graded):
         np.testing.assert_allclose(got, expected[3 - n :, 3 - n :], rtol=1e-5, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.full
 def test_image_curvature_at_a_step():
     """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform image it does not."""
     data = np.where(np.arange(40)[:, None, None] > 20, 100.0, 20.0) * np.ones((40, 36, 32))
@@ -145,9 +147,10 @@ def test_image_curvature_at_a_step():
             assert H[0, 0] >= max(H[1, 1], H[2, 2])
 
 
-@pytest.mark.parametrize(("n", "turned"), [(2, False), (3, False), (3, True)])
+@pytest.mark.full
+@pytest.mark.parametrize(("n", "turned"), [(2, False), (3, True)])
 def test_image_gradient_on_smooth_images(n, turned):
-    """The face integrals against central differences of the sampled E_D.
+    """The face integrals against central differences of the sampled E_D, at some of the nodes.
 
     The differences are taken over many voxels, so that the sampling's own noise averages out; what is left of it, and
     of the third derivative, is the band: 3e-3 of the largest derivative in 2-D, 8e-3 in 3-D, whose volumes are smaller.
@@ -157,7 +160,7 @@ def test_image_gradient_on_smooth_images(n, turned):
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     engine = Engine(image, mesh, 0.5)
     _, image_gradient = gradient(engine.state, node_stars(engine.state))
-    inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))
+    inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))[:: 3 if n == 2 else 6]
     expected = np.zeros((len(inner), n))
     for row, node in enumerate(inner):
         for d in range(n):
@@ -171,26 +174,6 @@ def test_image_gradient_on_smooth_images(n, turned):
     error = (image_gradient[inner, 3 - n :] - expected) * image.spacing
     size = np.abs(expected * image.spacing).max()
     assert np.sqrt((error**2).mean()) < (3e-3 if n == 2 else 8e-3) * size
-
-
-def test_image_gradient_in_the_mean_on_noise():
-    """On a noisy step the two still point the same way: their correlation over all nodes is high."""
-    rng = np.random.default_rng(0)
-    data = np.where(np.arange(60)[:, None, None] > 29, 100.0, 20.0) + rng.normal(0, 10, (60, 56, 52))
-    image = tetopt.Image(data)
-    mesh = tetopt.lattice_mesh(image, blocks=(5, 5, 5))
-    engine = Engine(image, mesh, 0.5)
-    _, image_gradient = gradient(engine.state, node_stars(engine.state))
-    inner = np.flatnonzero(~engine.complex.is_frozen.any(axis=1))
-    expected = []
-    for node in inner:
-        ends = []
-        for sign in (1, -1):
-            moved = mesh.points.copy()
-            moved[node, 0] += sign * 1.5
-            ends.append(tetopt.E_D(image, tetopt.Mesh(moved, mesh.cells)))
-        expected.append(engine.objective.image * (ends[0] - ends[1]) / 3.0)
-    assert np.corrcoef(image_gradient[inner, 0], expected)[0, 1] > 0.97
 
 
 # Moves.
@@ -226,17 +209,7 @@ def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
         assert n_cells_below(engine.state, 15.0) <= repaired.n_below
 
 
-def test_nodes_stay_on_their_faces():
-    engine = random_case(3, 3)
-    before = engine.complex.ticks.copy()
-    for _ in range(3):
-        engine.sweep()
-        engine.flip()
-    moved = engine.complex.ticks != before
-    assert moved.any()
-    assert not (moved & engine.complex.is_frozen[:, :3]).any()
-
-
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_flips_at_k_D_0_tend_to_delaunay(n):
     """The lifted surface's interpolation error is E_G, least for Delaunay.
@@ -308,16 +281,18 @@ def test_mappings(name, k_D, boundary):
         assert dihedral_angles(result.mesh.points, result.mesh.cells).min() >= 12.0 - 1e-6
 
 
-@pytest.mark.parametrize("name", ["3-D", "oblique"])
-def test_reaches_lower_than_the_paper(name):
+@pytest.mark.full
+def test_reaches_lower_than_the_paper():
     """With the paper's own energy (p = 1, no minimum angle) the same iterations end lower."""
-    image, blocks = CASES[name]
+    image, blocks = CASES["oblique"]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    paper = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20)
-    fast = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0)
+    paper = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=8)
+    fast = tetopt.optimize(image, mesh, k_D=0.5, iterations=8, shape_power=1.0, min_dihedral=0.0)
     assert fast.history[-1].E < paper.history[-1].E
 
 
+@pytest.mark.full
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads to compare")
 def test_same_bits_for_any_number_of_threads():
     image = ball((40, 44, 36))
     mesh = tetopt.lattice_mesh(image, nodes=1500)
@@ -332,10 +307,11 @@ def test_same_bits_for_any_number_of_threads():
         assert [row[:-1] for row in other.history] == [row[:-1] for row in results[0].history]
 
 
+@pytest.mark.full
 def test_the_minimum_dihedral_angle():
     """Higher ones are reached too, up to what a coarse ball allows; without one, worse cells are left."""
     image, _ = CASES["3-D"]
-    mesh = tetopt.lattice_mesh(image, nodes=400)
+    mesh = tetopt.lattice_mesh(image, nodes=250)
     worst = {}
     for min_dihedral in (0.0, 12.0, 20.0):
         made = tetopt.optimize(image, mesh, k_D=0.5, min_dihedral=min_dihedral).mesh
@@ -381,8 +357,9 @@ def test_flips_leave_nothing_to_gain():
     assert flips.flip(run.state)[1] <= 2
 
 
+@pytest.mark.full
 def test_removing_an_edge_takes_the_best_triangulation():
-    """Every edge of random meshes against all triangulations of its polygon, each measured afresh."""
+    """Edges of a random mesh against all triangulations of its polygon, each measured afresh."""
 
     def triangulations(i, j):
         if j == i + 1:
@@ -397,7 +374,7 @@ def test_removing_an_edge_takes_the_best_triangulation():
     ring, around = work.ring, work.around
     cells, across, is_all = engine.complex.cells, engine.complex.across, np.ones(len(engine.cells), dtype=bool)
     edges = gained = 0
-    for cell in range(len(engine.cells)):
+    for cell in range(0, len(engine.cells), 4):
         for i, j in flips.TET_EDGES:
             m, is_open = flips.ring_of_edge(ring, around, cells, across, cell, i, j, is_all)
             if m < 3 or is_open:
@@ -417,8 +394,8 @@ def test_removing_an_edge_takes_the_best_triangulation():
                 assert worth == pytest.approx(old - best, rel=1e-6)
             else:
                 assert worth == -np.inf
-    assert edges > 30
-    assert gained > 5
+    assert edges > 20
+    assert gained > 2
 
 
 def energy_of(engine, tets):
@@ -501,30 +478,6 @@ def test_stops_and_tells_why():
     np.testing.assert_allclose(none.mesh.points, mesh.points, atol=1e-5)
 
 
-def test_constant_image():
-    image = tetopt.Image(np.full((9, 8, 7), 5.0))
-    mesh = tetopt.lattice_mesh(image, blocks=(3, 3, 3))
-    result = tetopt.optimize(image, mesh, k_D=0.5, iterations=4)
-    assert result.history[0].E == pytest.approx(0.5)
-    assert all(row.E_D == 0.0 and row.n_voxels == image.data.size for row in result.history)
-
-
-def test_any_conforming_mesh(tmp_path):
-    """A mesh of part of the box, with a reentrant corner: its outside nodes stay, E falls, it stays a mesh."""
-    image, blocks = CASES["3-D"]
-    whole = tetopt.lattice_mesh(image, blocks=blocks)
-    centre = image.to_index(whole.points[whole.cells].mean(axis=1))
-    cells = whole.cells[~(centre > np.array(image.shape) / 2).all(axis=1)]
-    used, compact = np.unique(cells, return_inverse=True)
-    part = tetopt.Mesh(whole.points[used], compact.reshape(cells.shape))
-    result = tetopt.optimize(image, part, k_D=0.3, iterations=5)
-    assert tetopt.check_mesh(result.mesh) == []
-    assert result.history[-1].E < result.history[0].E
-    assert {row.n_voxels for row in result.history} == {result.history[0].n_voxels}
-    volume = [tetopt.quality(m.points, m.cells).volume for m in (part, result.mesh)]
-    assert volume[0] == pytest.approx(volume[1], rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -540,13 +493,6 @@ def test_refuses(options, words):
     image, blocks = CASES["3-D"]
     with pytest.raises(tetopt.InputError, match=words):
         tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=blocks), **options)
-
-
-def test_refuses_doubled_cells():
-    image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    with pytest.raises(tetopt.InputError, match="or more than two"):
-        tetopt.optimize(image, tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[:1]])))
 
 
 def test_run_measures_what_it_has():

@@ -202,6 +202,7 @@ def balls():
     return tetopt.mesh_image(content(CASES["balls"], labels=CASES["balls"], weights=[0.0]), 1500)
 
 
+@pytest.mark.full
 def test_balls(balls):
     """Two nested balls: their surfaces are within a tenth of a voxel, whole, manifold and without folds."""
     rows = {row.label: row for row in label_interfaces(CASES["balls"], balls.mesh, balls.labels)}
@@ -225,6 +226,7 @@ def test_balls(balls):
     assert tetopt.quality(balls.mesh.points, balls.mesh.cells).min_dihedral >= 12.0
 
 
+@pytest.mark.full
 def test_same_bits_on_any_number_of_threads(balls):
     before = numba.get_num_threads()
     try:
@@ -253,6 +255,7 @@ def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
         assert constraint_values(normal, state, node) == 2
 
 
+@pytest.mark.full
 def test_thick_slices_do_not_show():
     """A ball on slices four times as thick as voxels: no fold between slices, and half of the steps' area is gone."""
     fine = ball_in_ball(32)
@@ -261,11 +264,11 @@ def test_thick_slices_do_not_show():
     target = content(thick, labels=thick, weights=[0.0])
     assert target.image.shape == (32, 32, 3 * data.shape[2])
     np.testing.assert_allclose(target.image.volume, thick.volume)
-    result = tetopt.mesh_image(target, 1200)
+    result = tetopt.mesh_image(target, 1200, iterations=8)
     row = label_interfaces(thick, result.mesh, result.labels)[1]
     assert row.folded < 0.08
     assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
-    rough = tetopt.mesh_image(content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200)
+    rough = tetopt.mesh_image(content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200, iterations=8)
     assert rough.labels is None
     before = label_interfaces(thick, rough.mesh, tetopt.cell_labels(thick, rough.mesh))[1]
     assert before.folded > 4.0 * row.folded
@@ -310,6 +313,7 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
         assert stated == there or (len(stated) == 4 and stated < there)
 
 
+@pytest.mark.full
 def test_uniform_meshes_go_on_with_labels():
     """E is another one once cells have labels, and higher: that is not yet the end."""
     at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
@@ -322,6 +326,7 @@ def test_uniform_meshes_go_on_with_labels():
     assert few.labels is not None
 
 
+@pytest.mark.full
 def test_the_minimum_dihedral_angle_within_a_mask():
     """Nodes are brought between labels without a flat cell, which might not be lifted again."""
     image = patches(2, 12, 20)

@@ -47,12 +47,12 @@ def box(n, count, seed):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_keeps_topology_as_its_twin(n):
-    """On thousands of random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
+    """On hundreds of random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
     rng, n_kept, n_asked = np.random.default_rng(7), 0, 0
-    for seed in range(6):
+    for seed in range(2):
         points, cells = box(n, 25, seed) if seed % 2 else lattice(n, 2)
         across, star = across_of(cells, len(points)), stars(cells, len(points))
-        for _ in range(8):
+        for _ in range(6):
             # Half spaces with noise: few cells of pure noise may change.
             place = points[cells].mean(axis=1) @ rng.normal(size=n)
             labels = np.digitize(place, np.quantile(place, [0.3, 0.6]))
@@ -64,7 +64,7 @@ def test_keeps_topology_as_its_twin(n):
                     n_asked, n_kept = n_asked + 1, n_kept + keeps
                     if keeps:
                         assert_same_topology(cells, labels, cell, label)
-    assert n_asked >= 1000
+    assert n_asked >= 200
     assert n_kept > 0.05 * n_asked
 
 
@@ -93,6 +93,7 @@ def test_what_is_not_manifold_as_the_twin(n):
         assert len(bad) > 1
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_moves_lower_the_energy(n):
     """By cells of random content: each time cells settle it falls, and no move of one cell is left that lowers it."""
@@ -112,16 +113,17 @@ def test_moves_lower_the_energy(n):
     after = energy(labels)
     assert moved > 0
     assert after < before
-    for cell in range(len(cells)):
+    for cell in range(0, len(cells), 3):
         for other in dual.across[cell][dual.across[cell] >= 0]:
             changed = labels.copy()
             changed[cell] = labels[other]
             assert energy(changed) >= after - 1e-6
 
 
+@pytest.mark.full
 def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
-    points, cells = box(3, 16, 4)
+    points, cells = box(3, 12, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
     dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
@@ -147,7 +149,7 @@ def test_a_bridge_is_the_cheapest():
         assert np.isin(after[ends], after[sources]).any()
         assert np.isinf(way).all()
         n_bridges += 1
-    assert n_bridges > 5
+    assert n_bridges > 2
 
 
 def ball(n_blocks=7, radius=7.5, seed=None):

@@ -31,6 +31,7 @@ def test_graded():
     assert min(result.seconds_start, result.seconds_run) > 0.0
 
 
+@pytest.mark.full
 def test_threads_of_python_mesh_at_once():
     """Each to the bits of a run alone; what nobody catches (`sys.unraisablehook`) stays the user's to see."""
     hook, nodes = sys.unraisablehook, [150, 200, 150, 200]
@@ -56,17 +57,18 @@ def test_uniform(mask):
     assert_same(result, tetopt.optimize(image, initial, k_D=0.2, iterations=2, shape_power=2.0))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_nodes_of_order_2_are_counted_in_all(n):
     """Corners and midpoints together; the same run as with these corners and this longest edge from the start."""
     image = IMAGE if n == 3 else tetopt.Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
     nodes = 900 if n == 3 else 300
-    result = tetopt.mesh_image(image, nodes, order=2, iterations=8)
+    result = tetopt.mesh_image(image, nodes, order=2, iterations=4)
     points, cells = result.mesh.points, result.mesh.cells
     assert abs(len(quadratic(points, cells)[0]) - nodes) <= 0.01 * nodes
     assert result.nodes == nodes
     sizes = sizes_of_order(plain(image), nodes, None, 2)
-    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=8), result)
+    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=4), result)
 
 
 def test_a_lattice_for_order_2():
@@ -108,6 +110,7 @@ def test_a_mesh_to_start_from():
     assert_same(slid, tetopt.optimize(IMAGE, start, k_D=0.5, iterations=2))
 
 
+@pytest.mark.full
 def test_runs_are_watched():
     """Each run towards an error is shown its initial mesh, and what it returns is what counts."""
     starts, rows = [], []
@@ -116,11 +119,11 @@ def test_runs_are_watched():
         starts.append(initial)
         return run(callback=rows.append)
 
-    result = tetopt.mesh_image(IMAGE, target_error=0.2, iterations=4, watch=watch)
-    assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=4))
+    result = tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3, watch=watch)
+    assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3))
     assert sum(row.iteration == 0 for row in rows) == len(starts) > 1
     assert any(initial is result.initial for initial in starts)
-    assert_same(result, tetopt.mesh_image(IMAGE, result.nodes, iterations=4))
+    assert_same(result, tetopt.mesh_image(IMAGE, result.nodes, iterations=3))
 
 
 @pytest.mark.parametrize(

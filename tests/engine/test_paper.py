@@ -2,83 +2,48 @@
 
 import sys
 
+import naive
 import numba
 import numpy as np
 import pytest
-from naive import circumcentres
 from scipy.spatial import Delaunay
+from states import CASES, ball
 
 import tetopt
-from tetopt.energy.geometric import E_G_gradient, star_volumes
 from tetopt.energy.sampling import sampling_grid, to_ticks
-from tetopt.engine.loop import frozen_axes
+from tetopt.engine.loop import frozen_axes, side_ticks
 from tetopt.engine.paper import default_n_t, optimize_paper
 from tetopt.geometry.simplex import oriented, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, stars
 from tetopt.start.delaunay import delaunay
 
-OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
-
-
-def ball(shape, affine=None, contrast=100.0):
-    """A bright ellipsoid in the middle of the box, with a smooth ramp so that no region is constant."""
-    index = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in shape], indexing="ij"), -1)
-    data = contrast * ((index**2).sum(-1) < 0.4) + 5.0 * index[..., 0] + np.round(3.0 * index[..., -1])
-    return tetopt.Image(data, np.eye(len(shape) + 1) if affine is None else affine)
-
-
-CASES = {
-    "2-D": (ball((40, 30)), (6, 5)),
-    "3-D": (ball((24, 20, 22)), (4, 3, 4)),
-    "oblique": (ball((24, 20, 10), OBLIQUE), (4, 4, 4)),
-}
-
-
-def domain_problems(image, mesh):
-    """What is wrong with a mesh that should fill the image's box; empty if nothing."""
-    problems = []
-    if not np.isclose(volumes(mesh.points, mesh.cells).sum(), image.volume, rtol=1e-12, atol=0.0):
-        problems.append("volume")
-    sides = facets(mesh.cells)
-    if sides.n_cells.max() > 2:
-        problems.append("a facet in three cells")
-    index = image.to_index(mesh.points)[boundary_facets(mesh.cells)]
-    on_box = [
-        np.isclose(index, -0.5, atol=1e-9).all(1),
-        np.isclose(index, np.array(image.shape) - 0.5, atol=1e-9).all(1),
-    ]
-    if not np.any(on_box, axis=(0, 2)).all():
-        problems.append("a boundary facet off the box")
-    if len(np.unique(mesh.cells)) != len(mesh.points):
-        problems.append("an unused node")
-    return problems
-
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("k_D", [0.0, 0.3])
 @pytest.mark.parametrize("retessellate", ["first", "accept", "never"])
-def test_mappings(name, k_D, retessellate):
+def test_mappings(name, retessellate):
     """Every iteration holds every voxel; E never rises on a fixed connectivity, nor at all with "accept"."""
     image, blocks = CASES[name]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    result = optimize_paper(image, mesh, k_D=k_D, iterations=8, n_t=4, retessellate=retessellate)
-    assert domain_problems(image, result.mesh) == []
+    result = optimize_paper(image, mesh, k_D=0.3, iterations=8, n_t=4, retessellate=retessellate)
+    assert tetopt.check_mesh(result.mesh, image) == []
     assert {row.n_voxels for row in result.history} == {image.data.size}
     for before, after in zip(result.history, result.history[1:], strict=False):
         if retessellate != "first" or not after.is_retessellated:
             assert after.E <= before.E * (1.0 + 1e-12)
-    if k_D > 0.0:  # a lattice is stationary for the shapes alone, or nearly
-        assert result.history[-1].E < 0.99
+    assert result.history[-1].E < 0.99
     assert any(row.is_retessellated for row in result.history) <= (retessellate != "never")
     if retessellate == "never":
         np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_history_holds_the_energies_of_the_mesh(name):
-    """The running totals of the last row are those of the returned mesh, measured afresh."""
-    image, blocks = CASES[name]
-    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.4, iterations=5)
+def test_history_holds_the_energies_of_the_mesh():
+    """The running totals of the last row are those of the returned mesh, measured afresh; the callback sees all."""
+    image, blocks = CASES["oblique"]
+    seen = []
+    result = optimize_paper(
+        image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.4, iterations=5, callback=seen.append
+    )
+    assert seen == result.history
     last, first = result.history[-1], result.history[0]
     assert last.E_G == pytest.approx(tetopt.E_G(result.mesh.points, result.mesh.cells), rel=1e-9)
     assert last.E_D == pytest.approx(tetopt.E_D(image, result.mesh), rel=1e-9)
@@ -99,22 +64,23 @@ def test_the_image_pulls_the_mesh():
     assert E_D[2] < 0.7 < E_D[0]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_lloyd_reaches_a_stationary_mesh(name):
+def test_lloyd_reaches_a_stationary_mesh():
     """At k_D = 0, connectivity fixed, the gradient of E_G along the directions that are free goes to 0."""
-    image, blocks = CASES[name]
+    image, blocks = CASES["oblique"]
     n = image.ndim
     rng = np.random.default_rng(3)
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    ticks = to_ticks(image.to_index(mesh.points), sampling_grid(image, mesh.points))
-    frozen = frozen_axes(image, ticks, mesh.cells, sampling_grid(image, mesh.points), "slide")[:, 3 - n : 3]
+    grid = sampling_grid(image, mesh.points)
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    frozen = frozen_axes(ticks, boundary_facets(mesh.cells), side_ticks(grid), "slide", False)[:, 3 - n : 3]
     step = 0.12 * np.array(image.shape) / np.array(blocks)
     start = image.to_world(image.to_index(mesh.points) + ~frozen * rng.uniform(-step, step, mesh.points.shape))
     mesh = tetopt.Mesh(start, mesh.cells)
     result = optimize_paper(image, mesh, k_D=0.0, iterations=300, retessellate="never", tolerance=1e-7)
     assert result.ended == "converged"
     along = [
-        np.where(frozen, 0.0, E_G_gradient(p, mesh.cells) @ image.affine[:-1, :-1]) for p in (start, result.mesh.points)
+        np.where(frozen, 0.0, naive.E_G_gradient(p, mesh.cells) @ image.affine[:-1, :-1])
+        for p in (start, result.mesh.points)
     ]
     assert np.abs(along[1]).max() < 2e-4 * np.abs(along[0]).max()
 
@@ -128,33 +94,17 @@ def test_lloyd_moves_to_the_weighted_circumcentre():
     cells = oriented(points, cells[np.abs(volumes(points, cells)) > 1e-9])
     star = cells[stars(cells, 9).cells[stars(cells, 9).start[8] :]]
     v = volumes(points, star)
-    expected = (v[:, None] * circumcentres(points, star)).sum(0) / v.sum()
-    assert v.sum() == pytest.approx(star_volumes(points, cells)[8])
+    expected = (v[:, None] * naive.circumcentres(points, star)).sum(0) / v.sum()
     result = optimize_paper(
         image, tetopt.Mesh(points, cells), k_D=0.0, iterations=1, retessellate="never", boundary="fixed"
     )
     np.testing.assert_allclose(result.mesh.points[8], expected, atol=1e-6)
 
 
-def test_random_nodes_become_well_shaped():
-    """Lloyd's alternation as in Fig. 1: mean rho of random nodes in a square rises to near 1/2."""
-    image = tetopt.Image(np.zeros((50, 50)) + np.arange(50))
-    rng = np.random.default_rng(0)
-    side = np.linspace(-0.5, 49.5, 6)
-    frame = np.unique(np.array([(x, y) for x in side for y in side if {x, y} & {-0.5, 49.5}]), axis=0)
-    points = np.vstack([frame, rng.uniform(1.0, 48.0, (41, 2))])
-    mesh = tetopt.Mesh(points, oriented(points, Delaunay(points).simplices))
-    result = optimize_paper(image, mesh, k_D=0.0, iterations=100, boundary="fixed")
-    assert rho(points, mesh.cells).mean() < 0.38
-    assert rho(result.mesh.points, result.mesh.cells).mean() > 0.44
-    assert domain_problems(image, result.mesh) == []
-
-
 @pytest.mark.parametrize("boundary", ["slide", "fixed"])
-@pytest.mark.parametrize("name", CASES)
-def test_boundary_nodes(name, boundary):
+def test_boundary_nodes(boundary):
     """Fixed: none moves. Slide: each keeps the coordinates across its faces, corners keep all, some do move."""
-    image, blocks = CASES[name]
+    image, blocks = CASES["oblique"]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, k_D=0.5, iterations=4, retessellate="never", boundary=boundary)
     before, after = image.to_index(mesh.points), image.to_index(result.mesh.points)
@@ -181,14 +131,14 @@ def test_nodes_inside_the_box_on_a_free_boundary_stay():
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads to compare")
-@pytest.mark.parametrize("k_D", [0.0, 0.3])
-def test_same_bits_on_one_and_two_threads(k_D):
+@pytest.mark.full
+def test_same_bits_on_one_and_two_threads():
     image = ball((40, 44, 36))
     mesh = tetopt.lattice_mesh(image, nodes=1500)
     results = []
     for threads in (1, 2, 2):
         numba.set_num_threads(threads)
-        results.append(optimize_paper(image, mesh, k_D=k_D, iterations=4))
+        results.append(optimize_paper(image, mesh, k_D=0.3, iterations=4))
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for other in results[1:]:
         assert other.mesh.points.tobytes() == results[0].mesh.points.tobytes()
@@ -230,15 +180,6 @@ def test_constant_image():
     assert result.history[-1].E <= 0.5
 
 
-def test_no_iterations_returns_the_mesh():
-    image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice_mesh(image, blocks=blocks)
-    result = optimize_paper(image, mesh, iterations=0)
-    np.testing.assert_allclose(result.mesh.points, mesh.points, atol=1e-6)
-    np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
-    assert [row.iteration for row in result.history] == [0]
-
-
 def test_converges():
     """It stops by itself once the nodes move less than the tolerance."""
     image, blocks = CASES["2-D"]
@@ -258,14 +199,13 @@ def test_retessellation_ends_after_n_t():
     assert max(anew) <= 3
 
 
-@pytest.mark.parametrize("how", ["max_seconds", "stop"])
-def test_ended_early_with_a_valid_mesh(how):
+def test_ended_early_with_a_valid_mesh():
     image, blocks = CASES["3-D"]
-    options = {"max_seconds": 1e-6} if how == "max_seconds" else {"stop": lambda: True}
-    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.3, iterations=1000, **options)
-    assert result.ended == {"max_seconds": "max_seconds", "stop": "stopped"}[how]
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
+    result = optimize_paper(image, mesh, k_D=0.3, iterations=1000, max_seconds=1e-6)
+    assert result.ended == "max_seconds"
     assert len(result.history) == 2
-    assert domain_problems(image, result.mesh) == []
+    assert tetopt.check_mesh(result.mesh, image) == []
 
 
 def test_stopped_in_the_middle_of_a_sweep():
@@ -281,24 +221,14 @@ def test_stopped_in_the_middle_of_a_sweep():
     )
     assert result.ended == "stopped"
     assert result.history[-1].movement > 0.0
-    assert domain_problems(image, result.mesh) == []
+    assert tetopt.check_mesh(result.mesh, image) == []
     assert result.history[-1].E_D == pytest.approx(tetopt.E_D(image, result.mesh), rel=1e-9)
-
-
-def test_callback_sees_every_record():
-    image, blocks = CASES["2-D"]
-    seen = []
-    result = optimize_paper(
-        image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.2, iterations=3, callback=seen.append
-    )
-    assert seen == result.history
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"k_D": 1.0}, r"k_D: expected 0 <= k_D < 1, got 1.0"),
-        ({"k_D": -0.1}, r"k_D: expected 0 <= k_D < 1, got -0.1"),
         ({"k_D": float("nan")}, r"k_D: expected 0 <= k_D < 1, got nan"),
         ({"iterations": -1}, r"iterations: expected 0 or more, got -1"),
         ({"n_t": -1}, r"n_t: expected 0 or more, got -1"),
@@ -318,6 +248,7 @@ def test_dimensions_must_agree():
         optimize_paper(CASES["3-D"][0], tetopt.lattice_mesh(CASES["2-D"][0], blocks=(2, 2)))
 
 
+@pytest.mark.full
 def test_real_volume(data_dir):
     """Laws on the MNI152 T1: every voxel in one cell after every iteration, E never rises, E_D falls well."""
     image = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
@@ -328,35 +259,18 @@ def test_real_volume(data_dir):
             assert after.E <= before.E * (1.0 + 1e-12)
     assert result.history[-1].E_D < 0.55 * result.history[0].E_D
     assert rho(result.mesh.points, result.mesh.cells).mean() > 0.285
-    assert domain_problems(image, result.mesh) == []
+    assert tetopt.check_mesh(result.mesh, image) == []
 
 
-def test_reference_run(data_dir):
-    """MNI152 T1, 5 k nodes, k_D = 0.2: E_D below 0.42 of its initial value, mean rho above 0.29.
-
-    In the first 6 of 20 iterations; the others lower E_D from 0.409 to 0.403.
-    """
-    image = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=5000), k_D=0.2, iterations=6, n_t=6)
-    assert result.history[-1].E_D < 0.42 * result.history[0].E_D
-    assert rho(result.mesh.points, result.mesh.cells).mean() > 0.29
-
-
-@pytest.mark.parametrize(
-    ("name", "nodes"),
-    [
-        ("brain_flair_oblique_aniso.nii.gz", 800),
-        ("prostate_t2_tra_prostatex0001.nii.gz", 800),
-        ("ct_abdomen_3mm.nii.gz", 800),
-    ],
-)
-def test_real_oblique_and_anisotropic(data_dir, name, nodes):
-    """5.5 mm slices, an oblique prostate, a CT with negative values: the same laws in world millimetres."""
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["prostate_t2_tra_prostatex0001.nii.gz", "ct_abdomen_3mm.nii.gz"])
+def test_real_oblique_and_anisotropic(data_dir, name):
+    """An oblique prostate, a CT with negative values: the same laws in world millimetres."""
     image = tetopt.load_image(data_dir / name)
-    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.3, iterations=4, n_t=2)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=800), k_D=0.3, iterations=2, n_t=1)
     assert {row.n_voxels for row in result.history} == {image.data.size}
     assert result.history[-1].E_D < 0.9 * result.history[0].E_D
-    assert domain_problems(image, result.mesh) == []
+    assert tetopt.check_mesh(result.mesh, image) == []
 
 
 # After a hostile review.
@@ -427,10 +341,9 @@ def turned_cell(cells):
 
 
 @pytest.mark.parametrize("spoil", [missing_cell, doubled_cell, turned_cell])
-@pytest.mark.parametrize("name", CASES)
-def test_spoiled_tessellations_are_not_taken(name, spoil, monkeypatch):
+def test_spoiled_tessellations_are_not_taken(spoil, monkeypatch):
     """Delaunay cells with one left out, one twice or one turned: the old connectivity is kept."""
-    image, blocks = CASES[name]
+    image, blocks = CASES["3-D"]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     good = delaunay(image.to_index(mesh.points), image.affine)
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: spoil(good))

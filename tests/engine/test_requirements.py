@@ -8,6 +8,7 @@ import tetopt
 from tetopt.contents.content import content, plain
 from tetopt.engine.requirements import checked, requested
 from tetopt.geometry.check import manifold_problems
+from tetopt.start.carve import part_of
 
 
 def violated(target, result, min_dihedral=0.0, start=None):
@@ -28,6 +29,7 @@ def test_a_run_that_meets_all_violates_nothing(whole):
     assert whole[1].violated == {}
 
 
+@pytest.mark.full
 def test_the_minimum_dihedral_angle(whole):
     image, result = whole
     words = violated(image, result, 60.0)
@@ -55,6 +57,7 @@ def test_the_box_and_the_cover(whole):
     assert violated_request(image, fewer, None, False) == {}
 
 
+@pytest.mark.full
 def test_the_error(whole):
     image, result = whole
     fraction = result.history[-1].E_D / (plain(image).variance * image.volume)
@@ -64,6 +67,7 @@ def test_the_error(whole):
     assert ("error" in short.violated) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
 
 
+@pytest.mark.full
 def test_a_mask_and_overlaps():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
@@ -72,14 +76,14 @@ def test_a_mask_and_overlaps():
     last = result.history[-1]
     twice = result._replace(history=[last._replace(n_voxels=last.n_voxels + 2)])
     assert "2 voxels twice" in violated(target, twice)["overlap"]
-    half = result.mesh.cells[: len(result.mesh.cells) // 2]
-    used, cells = np.unique(half, return_inverse=True)
-    part = tetopt.Mesh(result.mesh.points[used], cells.reshape(half.shape))
+    n_cells = len(result.mesh.cells)
+    part = part_of(result.mesh, np.arange(n_cells) < n_cells // 2)
     n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
     halved = result._replace(mesh=part, history=[last._replace(n_voxels=n_voxels)])
     assert set(violated(target, halved)) - {"components", "manifold"} == {"mask"}
 
 
+@pytest.mark.full
 def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
     """Two tetrahedra of the mesh that share a node, and two far apart, are all that is left."""
     image, mask = shaped("ball")
@@ -88,9 +92,8 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
     cells = result.mesh.cells
     n_shared = (cells[:, :, None] == cells[0]).any(axis=2).sum(axis=1)
     for chosen, names in ((1, ["components", "manifold"]), (0, ["components"])):
-        pair = cells[[0, np.flatnonzero(n_shared == chosen)[0]]]
-        used, rows = np.unique(pair, return_inverse=True)
-        part = tetopt.Mesh(result.mesh.points[used], rows.reshape(pair.shape))
+        pair = [0, np.flatnonzero(n_shared == chosen)[0]]
+        part = part_of(result.mesh, np.isin(np.arange(len(cells)), pair))
         n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
         row = result.history[-1]._replace(n_voxels=n_voxels)
         found = violated(target, result._replace(mesh=part, history=[row]))
@@ -98,6 +101,7 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
         assert "2 connected components, the mask 1" in found["components"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"])
 def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(name, monkeypatch):
     def fail(*_):
@@ -133,6 +137,7 @@ def test_an_interface_that_touches_itself():
     assert f"[[{node}]]" in words["manifold"]
 
 
+@pytest.mark.full
 def test_labels_without_cells():
     image, _ = shaped("ball")
     labels = np.zeros(image.shape)
@@ -146,8 +151,14 @@ def test_labels_without_cells():
         "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
     }
     assert violated(target, result._replace(labels=None)) == {}
+    # Within a mask label 0 is the outside, too.
+    within = content(image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine))
+    no_zero = result._replace(labels=np.where(result.labels == 0, 3, result.labels))
+    assert "no cell has label 0" in violated(target, no_zero)["labels"]
+    assert "labels" not in violated(within, no_zero)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
 def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     image, mask = shaped("ball")
@@ -158,6 +169,7 @@ def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     assert not {"manifold", "labels"} & set(result.violated)
 
 
+@pytest.mark.full
 def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
     image, mask = shaped("ball")
     start = tetopt.mesh_image(content(image, mask=mask), 300, iterations=1).mesh
@@ -166,6 +178,7 @@ def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
     assert "labels" not in result.violated
 
 
+@pytest.mark.full
 def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
     image, _ = whole
     assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).violated == {}

@@ -22,6 +22,7 @@ def image_of(shape):
     return tetopt.Image(np.random.default_rng(0).uniform(1.0, 10.0, shape))
 
 
+@pytest.mark.full
 def test_time_and_iterations_set_the_size(monkeypatch):
     """Seconds over those of an iteration of all references; no more than the image has, no less than a thousand."""
     image = image_of((40, 30, 35))

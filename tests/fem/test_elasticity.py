@@ -28,6 +28,7 @@ from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.start.carve import part_of
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
@@ -95,7 +96,7 @@ def textbook_stiffness(mesh, young, nu):
     return K
 
 
-@pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.49])
+@pytest.mark.parametrize("nu", [-0.5, 0.3])
 @pytest.mark.parametrize("case", ALL_SMALL)
 def test_stiffness_is_the_textbook_s(case, nu):
     mesh = Mesh(*case)
@@ -104,12 +105,11 @@ def test_stiffness_is_the_textbook_s(case, nu):
     np.testing.assert_allclose(stiffness(mesh, young, nu).toarray(), expected, atol=1e-13 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.45])
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [2, 3])
-def test_stiffness_is_scikit_fem_s(n, order, nu):
+def test_stiffness_is_scikit_fem_s(n, order):
     """Node by node: scikit-fem's dofs are matched to ours by where they lie."""
-    mesh = random_mesh(np.random.default_rng(5), n, 40)
+    mesh, nu = random_mesh(np.random.default_rng(5), n, 20), 0.45
     young = np.random.default_rng(6).uniform(1.0, 9.0, len(mesh.cells))
     K, place = skfem_stiffness(mesh, young, nu, order)
     points = mesh.points if order == 1 else quadratic(mesh.points, mesh.cells)[0]
@@ -180,21 +180,15 @@ def test_stiffness_adds_up():
     assert not both[:size, size:].any()
 
 
-def test_one_modulus_for_all():
-    mesh = random_mesh(np.random.default_rng(2), 2)
-    assert (stiffness(mesh, 3.0, 0.3) != stiffness(mesh, np.full(len(mesh.cells), 3.0), 0.3)).nnz == 0
-
-
 # Patch test
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.45])
 @pytest.mark.parametrize(
     "name", ["distorted criss-cross", "split square", "distorted bcc", "distorted five-tet", "split cube"]
 )
-def test_patch(name, nu):
+def test_patch(name):
     """A linear displacement of the boundary is that of every inner node; all cells have its strain, no node a force."""
-    rng = np.random.default_rng(7)
+    rng, nu = np.random.default_rng(7), 0.45
     mesh = {
         "distorted criss-cross": lambda: distorted(block((2.0, 3.0), (4, 5))[1], rng),
         "split square": lambda: random_mesh(rng, 2, 40),
@@ -219,21 +213,11 @@ def test_patch(name, nu):
     assert np.abs(force[~is_boundary]).max() < 1e-10 * np.abs(force).max()
 
 
-@given(seeds, dimensions)
-def test_strains_of_a_linear_field(seed, n):
-    rng = np.random.default_rng(seed)
-    mesh = random_mesh(rng, n)
-    slope = rng.normal(size=(n, n))
-    strain = strains(mesh, mesh.points @ slope.T)
-    np.testing.assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
-    np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
-
-
 # Closed forms
 
 
 @pytest.mark.parametrize("method", ["direct", "amg"])
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+@pytest.mark.parametrize("nu", [0.0, 0.45])
 @pytest.mark.parametrize("sides", [(2.0, 5.0), (2.0, 3.0, 5.0)])
 def test_uniform_block_between_smooth_plates(sides, nu, method):
     """Uniaxial stress, sides free: E_strain = 1/2 E eps^2 V, the force E eps A; it widens by nu eps."""
@@ -249,17 +233,6 @@ def test_uniform_block_between_smooth_plates(sides, nu, method):
         strains(distorted(mesh, np.random.default_rng(0)), pressed.u), np.broadcast_to(along, (len(mesh.cells), n, n)),
         atol=1e-10,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
-@pytest.mark.parametrize("sides", [(4.0, 5.0), (4.0, 3.0, 5.0)])
-def test_two_moduli_side_by_side_between_smooth_plates(sides, nu):
-    """Columns of one strain: 1/2 eps^2 (E_1 V_1 + E_2 V_2), whatever nu, since both widen alike."""
-    image, mesh = block(sides, (4,) * len(sides), None if len(sides) == 2 else "five-tet")
-    is_left = mesh.points[mesh.cells].mean(axis=1)[:, 0] < sides[0] / 4.0
-    pressed = squeezed(mesh, image, np.where(is_left, 1.0, 10.0), nu, is_bonded=False)
-    expected = 0.5 * 0.01**2 * np.prod(sides) * (0.25 * 1.0 + 0.75 * 10.0)
-    assert pressed.strain_energy == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.parametrize("is_bonded", [True, False])
@@ -289,21 +262,6 @@ def test_block_in_a_rigid_frame(n):
     np.testing.assert_allclose(u, field, atol=1e-13)
     modulus = 3.0 / (1.0 - nu**2) if n == 2 else 3.0 * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
     assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(0.5 * modulus * 1e-4 * 2.0**n, rel=1e-12)
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_pure_shear_of_one_block(n):
-    """Every node is held, so there is nothing to solve: 1/2 mu gamma^2 V."""
-    image, mesh = block((1.0, 2.0, 3.0)[:n], (1,) * n, None if n == 2 else "five-tet")
-    push = np.zeros(n)
-    push[0] = 0.1
-    low, high = box_faces(image, mesh)
-    if n == 2:  # its centre is free: hold it, too, where the shear takes it
-        mesh = Mesh(mesh.points[:4], [[low[0], low[1], high[1]], [low[0], high[1], high[0]]])
-    pressed = compression(mesh, 5.0, 0.25, fixed_nodes=high, pushed_nodes=low, displacement=push)
-    assert len(pressed.system.free) == 0
-    height, volume = mesh.points[:, -1].max(), volumes(mesh.points, mesh.cells).sum()
-    assert pressed.strain_energy == pytest.approx(0.5 * 2.0 * (0.1 / height) ** 2 * volume, rel=1e-13)
 
 
 # Laws of the compression
@@ -357,46 +315,6 @@ def test_rotated(seed, n, is_bonded):
     np.testing.assert_allclose(other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max())
 
 
-@pytest.mark.parametrize("is_bonded", [True, False])
-@pytest.mark.parametrize("n", [2, 3])
-def test_scaling(n, is_bonded):
-    """Energy is linear in the moduli, quadratic in the push; a mesh s times as large at equal strain has s^n of it."""
-    rng = np.random.default_rng(4)
-    image, mesh = block((1.0, 2.0, 3.0)[:n], (2,) * n)
-    young = rng.uniform(1.0, 9.0, len(mesh.cells))
-    low, high = box_faces(image, mesh)
-    push = np.array([0.1, -0.2, 0.3])[:n]
-
-    def energy(size=1.0, factor=1.0, push=push):
-        scaled = Mesh(size * mesh.points, mesh.cells)
-        return compression(
-            scaled, factor * young, 0.45, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded
-        ).strain_energy
-
-    base = energy()
-    assert energy(factor=7.0) == pytest.approx(7.0 * base, rel=1e-10)
-    assert energy(push=-3.0 * push) == pytest.approx(9.0 * base, rel=1e-10)
-    assert energy(size=5.0, push=5.0 * push) == pytest.approx(5.0**n * base, rel=1e-10)
-    assert energy(size=5.0) == pytest.approx(5.0 ** (n - 2) * base, rel=1e-10)
-
-
-def test_holding_more_and_stiffening_take_more_energy():
-    """Smooth plates allow all that bonded ones do; a stiffer cell anywhere costs; nu narrows what is free."""
-    rng = np.random.default_rng(9)
-    image, mesh = block((2.0, 3.0, 2.5), (3, 3, 3))
-    young = rng.uniform(1.0, 9.0, len(mesh.cells))
-    bonded = squeezed(mesh, image, young, 0.4).strain_energy
-    assert squeezed(mesh, image, young, 0.4, is_bonded=False).strain_energy < 0.99 * bonded
-    for cell in rng.choice(len(mesh.cells), 5, replace=False):
-        stiffer = young.copy()
-        stiffer[cell] *= 2.0
-        assert squeezed(mesh, image, stiffer, 0.4).strain_energy > bonded * (1.0 + 1e-6)
-    # Voigt and Reuss: between smooth plates the energy lies between those of equal stress and equal strain.
-    v = volumes(mesh.points, mesh.cells) / 15.0
-    smooth = squeezed(mesh, image, young, 0.0, is_bonded=False).strain_energy / (0.5 * 0.01**2 * 15.0)
-    assert 1.0 / (v / young).sum() < smooth < (v * young).sum()
-
-
 # Refinement
 
 
@@ -429,6 +347,7 @@ def refined(mesh, young):
     return fine, np.repeat(young, len(ends))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("n", [2, 3])
 def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
@@ -443,7 +362,7 @@ def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
     young = np.where(is_stiff, 20.0, 1.0)
     assert 0 < is_stiff.sum() < len(is_stiff)
     energies = []
-    for _ in range(6 if n == 2 else 4):
+    for _ in range(5 if n == 2 else 3):
         energies.append(squeezed(mesh, image, young, 0.3, is_bonded=is_bonded).strain_energy)
         mesh, young = refined(mesh, young)
     steps = -np.diff(energies)
@@ -455,20 +374,22 @@ def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
 # Solvers
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("sides", [(4.0, 5.0), (4.0, 3.0, 5.0)])
 def test_multigrid_and_factorisation_agree(sides, is_bonded):
     rng = np.random.default_rng(8)
-    image, mesh = block(sides, (40, 50) if len(sides) == 2 else (9, 7, 10))
+    image, mesh = block(sides, (36, 45) if len(sides) == 2 else (7, 6, 8))
     mesh = distorted(mesh, rng)
     young = np.exp(rng.uniform(0.0, np.log(1000.0), len(mesh.cells)))
     direct = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="direct")
     amg = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="amg")
-    assert len(amg.system.free) > 3000
+    assert len(amg.system.free) > 2000
     np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("is_bonded", [True, False])
 def test_a_multigrid_cycle_is_symmetric_and_positive(is_bonded):
     """What conjugate gradients need of a preconditioner."""
@@ -509,24 +430,21 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
 
 @given(seeds, dimensions)
 def test_faces_of_any_affine(seed, n):
-    """Oblique, sheared, flipped: every face is found, by index coordinates; the top lies higher along z (y in 2-D)."""
+    """Oblique, sheared, flipped: both faces are found, by index coordinates; the top lies higher along z (y in 2-D)."""
     rng = np.random.default_rng(seed)
     image = Image(np.zeros(rng.integers(2, 9, n)), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 4, n))
     mesh = lattice_mesh(image, blocks=blocks)
     index = image.to_index(mesh.points)
     directions = image.affine[:n, :n] / image.spacing
-    default = int(np.argmax(np.abs(directions[-1])))
-    for axis in range(n):
-        low, high = box_faces(image, mesh, axis)
-        ends = [np.flatnonzero(index[:, axis] < -0.499), np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501)]
-        assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
-        assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
-        shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
-        np.testing.assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
-        assert shift[n - 1 if axis == default else np.argmax(np.abs(shift))] > 0.0
-    for one, other in zip(box_faces(image, mesh), box_faces(image, mesh, default), strict=True):
-        np.testing.assert_array_equal(one, other)
+    axis = int(np.argmax(np.abs(directions[-1])))
+    low, high = box_faces(image, mesh)
+    ends = [np.flatnonzero(index[:, axis] < -0.499), np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501)]
+    assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
+    assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
+    shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
+    np.testing.assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
+    assert shift[-1] > 0.0
 
 
 def test_default_axis_is_the_one_along_z():
@@ -537,9 +455,6 @@ def test_default_axis_is_the_one_along_z():
     low, high = box_faces(image, mesh)
     assert mesh.points[low, 2] == pytest.approx(3.0 - 1.5 * 3.5)
     assert mesh.points[high, 2] == pytest.approx(3.0 + 1.5 * 0.5)
-    for axis, world in ((0, 1), (2, 0)):
-        low, high = box_faces(image, mesh, axis)
-        assert mesh.points[low, world].max() < mesh.points[high, world].min()
 
 
 def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
@@ -547,10 +462,9 @@ def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
     affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
     image = Image(np.zeros((3, 3, 3)), affine)
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
-    for axis in (None, 2):
-        low, high = box_faces(image, mesh, axis)
-        np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
-        np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
+    low, high = box_faces(image, mesh)
+    np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
+    np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
 
 
 def test_a_node_just_off_the_face_is_not_on_it():
@@ -629,9 +543,7 @@ def test_a_tetrahedron_on_a_hinge_is_named():
 def test_smooth_plates_do_not_hold_two_columns():
     image, mesh = block((3.0, 1.0), (3, 1))
     centre = mesh.points[mesh.cells].mean(axis=1)[:, 0]
-    cells = mesh.cells[(centre < 1.0) | (centre > 2.0)]
-    used, cells = np.unique(cells, return_inverse=True)
-    columns = Mesh(mesh.points[used], cells.reshape(-1, 3))
+    columns = part_of(mesh, (centre < 1.0) | (centre > 2.0))
     squeezed(columns, image, 1.0, 0.3)
     with pytest.raises(InputError, match=r"can still turn or slide as a whole"):
         squeezed(columns, image, 1.0, 0.3, is_bonded=False)
@@ -640,9 +552,9 @@ def test_smooth_plates_do_not_hold_two_columns():
 # Messages
 
 
-def message_of(call):
+def message_of(call, *arguments):
     with pytest.raises(InputError) as error:
-        call()
+        call(*arguments)
     return str(error.value)
 
 
@@ -652,119 +564,63 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"young": [1.0, 0.0]},
-            "young: expected moduli above 0 kPa, got 1 others, the first 0 in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
-        (
-            {"young": [np.nan, -2.5]},
-            "young: expected moduli above 0 kPa, got 2 others, the first nan in cell 0, -2.5 in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
-        (
-            {"young": np.inf},
-            "young: expected moduli above 0 kPa, got 2 others, the first inf in cell 0, inf in cell 1; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
-        ),
+        ({"young": [1.0, 0.0]}, "above 0 kPa, got 1 others, the first 0 in cell 1; give empty space a small modulus"),
+        ({"young": [np.nan, -2.5]}, "got 2 others, the first nan in cell 0, -2.5 in cell 1"),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
-        ({"young": [[1.0, 1.0], [2.0, 1.0]]}, "young: expected one modulus for each of 2 cells, got shape (2, 2)"),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
         ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue take 0.45 to 0.49"),
-        ({"nu": -1.0}, "nu: expected -1 < nu < 0.5, got -1.0; for nearly incompressible tissue take 0.45 to 0.49"),
-        ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan; for nearly incompressible tissue take 0.45 to 0.49"),
+        ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan"),
         ({"fixed_nodes": []}, "fixed_nodes: expected at least one node, got none"),
-        ({"pushed_nodes": np.empty(0, int)}, "pushed_nodes: expected at least one node, got none"),
         ({"fixed_nodes": [2.0, 3.0]}, "fixed_nodes: expected a list of node numbers, got float64 of shape (2,)"),
-        ({"fixed_nodes": [[2, 3]]}, "fixed_nodes: expected a list of node numbers, got int64 of shape (1, 2)"),
         ({"pushed_nodes": [0, 4]}, "pushed_nodes: node numbers must lie in 0..3, got 0..4"),
-        ({"pushed_nodes": [-1, 0]}, "pushed_nodes: node numbers must lie in 0..3, got -1..0"),
-        (
-            {"pushed_nodes": [0, 1, 3, 2]},
-            "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]; "
-            "they cannot rest and move by the displacement",
-        ),
+        ({"pushed_nodes": [0, 1, 3, 2]}, "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]"),
         ({"displacement": [0.0, 0.0]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, 0.0]"),
-        ({"displacement": [0.0]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0]"),
         ({"displacement": [0.0, np.nan]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, nan]"),
         ({"method": "lu"}, "method: expected auto, direct or amg, got 'lu'"),
     ],
 )
 def test_messages_of_compression(changes, message):
-    arguments = {
-        "young": [1.0, 2.0], "nu": 0.3, "fixed_nodes": [2, 3], "pushed_nodes": [0], "displacement": [0.0, 0.1],
-    } | changes  # fmt: skip
-    young, nu = arguments.pop("young"), arguments.pop("nu")
-    assert message_of(lambda: compression(PLATE, young, nu, **arguments)) == message
+    options = {"fixed_nodes": [2, 3], "pushed_nodes": [0], "displacement": [0.0, 0.1], "young": [1.0, 2.0], "nu": 0.3}
+    options |= changes
+    young, nu = options.pop("young"), options.pop("nu")
+    assert message in message_of(lambda: compression(PLATE, young, nu, **options))
 
 
 def test_messages_of_meshes_that_are_not_held():
     points = np.vstack([PLATE.points, PLATE.points + 10.0, PLATE.points + 20.0])
     pieces = Mesh(points, np.vstack([PLATE.cells, PLATE.cells + 4, PLATE.cells + 8]))
-    assert (
-        message_of(
-            lambda: compression(pieces, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
-        )
-        == "mesh: 2 components have no node that is held, pushed or on a spring, the first has 2 cells around cell 2 "
-        "(node 4); hold it or take it out"
+    options = {"fixed_nodes": [2, 3], "pushed_nodes": [0, 1], "displacement": [0.0, 0.1]}
+    words = message_of(lambda: compression(pieces, 1.0, 0.3, **options))
+    assert words.startswith(
+        "mesh: 2 components have no node that is held, pushed or on a spring, the first has 2 cells"
     )
-    unused = Mesh(points, PLATE.cells)
-    assert (
-        message_of(
-            lambda: compression(unused, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
-        )
-        == "mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]; take them out of the mesh"
-    )
+    words = message_of(lambda: compression(Mesh(points, PLATE.cells), 1.0, 0.3, **options))
+    assert words.startswith("mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]")
     nothing = np.zeros((4, 2))
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
-        == "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
-        "hold:SET and spring:SET:K do"
-    )
+    assert "nothing holds it" in message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
-    assert (
-        message_of(
-            lambda: compression(
-                PLATE, 1.0, 0.3, fixed_nodes=[2], pushed_nodes=[1], displacement=[0.0, 0.1], is_bonded=False
-            )
-        )
-        == "mesh: 2 cells around cell 0 (node 0) can still turn or slide as a whole, they hang by too few nodes; "
-        "hold more nodes or keep the largest facet-connected set"
-    )
+    options |= {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
+    assert "can still turn or slide as a whole" in message_of(lambda: compression(PLATE, 1.0, 0.3, **options))
 
 
 def test_messages_of_constrained():
-    is_held = np.zeros((4, 2), dtype=bool)
+    is_held, values = np.zeros((4, 2), dtype=bool), np.zeros((4, 2))
     is_held[:2] = True
-    values = np.zeros((4, 2))
     values[3] = np.nan  # not prescribed, so it does not count
     constrained(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held, values))
-        == "prescribed: displacements must be finite, node 1 has [inf, 0.0]"
-    )
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held[:, 0], values))
-        == "is_prescribed: expected shape (4, 2), a row a node, got (4,)"
-    )
-    assert (
-        message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held, values[:3]))
-        == "prescribed: expected shape (4, 2), a row a node, got (3, 2)"
-    )
+    for chosen, prescribed, words in (
+        (is_held, values, "prescribed: displacements must be finite, node 1 has [inf, 0.0]"),
+        (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), a row a node, got (4,)"),
+        (is_held, values[:3], "prescribed: expected shape (4, 2), a row a node, got (3, 2)"),
+    ):
+        assert words in message_of(lambda *given: constrained(PLATE, 1.0, 0.3, *given), chosen, prescribed)
 
 
 def test_messages_of_box_faces():
     image, mesh = block((1.0, 1.0, 1.0), (2, 2, 2))
-    assert (
-        message_of(lambda: box_faces(image, PLATE))
-        == "mesh and image: expected the same dimension, got a 2-D mesh and a 3-D image"
-    )
-    assert message_of(lambda: box_faces(image, mesh, 3)) == "axis: expected one of 0 to 2 in 3-D, got 3"
-    assert message_of(lambda: box_faces(image, mesh, -1)) == "axis: expected one of 0 to 2 in 3-D, got -1"
-    shrunk = Mesh(0.5 * mesh.points, mesh.cells)
-    assert (
-        message_of(lambda: box_faces(image, shrunk, 1))
-        == "mesh: no node lies on the image's face at index 0.5 of axis 1, the mesh runs from -0.5 to 0; "
-        "it must fill the image's box: same image, crop and slice?"
+    assert "same dimension, got a 2-D mesh and a 3-D image" in message_of(box_faces, image, PLATE)
+    words = message_of(box_faces, image, Mesh(0.5 * mesh.points, mesh.cells))
+    assert words.startswith(
+        "mesh: no node lies on the image's face at index 0.5 of axis 2, the mesh runs from -0.5 to 0"
     )

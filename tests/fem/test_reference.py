@@ -75,6 +75,7 @@ def test_bar_without_sideways_strain(n, flip):
     np.testing.assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
 
 
+@pytest.mark.full
 def test_meshes_tend_to_it():
     """A stiff ball in soft tissue: errors of ever finer lattices fall towards the voxel grid's solution."""
     image = tetopt.load_phantom("sphere").image(voxel_mm=3.0)
@@ -200,6 +201,7 @@ def test_refined_is_the_same_field():
     np.testing.assert_array_equal(refined(image, image.shape).data, image.data)
 
 
+@pytest.mark.full
 def test_own_error_is_that_of_half_the_resolution():
     """Energy and displacement of a reference on voxels twice as long; the homogeneous block is that of one modulus."""
     rng = np.random.default_rng(10)

@@ -9,7 +9,6 @@ import pytest
 import tetopt
 from tetopt.fem import voxel_kernels
 from tetopt.fem.voxels import (
-    _cycle,
     block_means,
     coarser,
     element_stiffness,
@@ -88,15 +87,6 @@ def test_rows_longer_than_a_chunk(monkeypatch):
     assert voxel_kernels.product(u, out) == pytest.approx(each * grid.young.sum(), rel=1e-12)
 
 
-def test_few_entries_are_left():
-    """Of 576: 45 with axes at right angles, 167 without; of 64 in the plane 10 and 20."""
-    counts = [
-        len(voxel_kernels.element_terms(element_stiffness(linear, 0.3)).row)
-        for linear in (STRAIGHT, SHEARED, STRAIGHT[:2, :2], SHEARED[:2, :2])
-    ]
-    assert counts == [45, 167, 10, 20]
-
-
 @kernel
 @pytest.mark.parametrize(("shape", "linear"), [SHAPES[0], SHAPES[5]])
 def test_product_and_cycle_are_symmetric(shape, linear):
@@ -158,7 +148,7 @@ def test_steps_of_the_iteration():
 
 @kernel
 @pytest.mark.parametrize(("shape", "linear"), SHAPES)
-@pytest.mark.parametrize("nu", [-0.3, 0.3, 0.45])
+@pytest.mark.parametrize("nu", [-0.3, 0.45])
 def test_solution_is_the_direct_one(shape, linear, nu):
     """To 1e-8 of the largest displacement, for every shape; the plates keep theirs."""
     grid, K, is_free = grid_and_oracle(shape, linear, nu)
@@ -188,15 +178,15 @@ def big(shape, linear, nu, contrast, seed=4):
     return grid, u
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("shape", "linear", "nu", "contrast", "iterations"),
     [
-        ((29, 33, 27), STRAIGHT, 0.3, 10.0, 40),
-        ((29, 33, 27), STRAIGHT, 0.45, 10.0, 60),
-        ((29, 33, 27), np.eye(3), 0.3, 1.0, 20),
+        ((19, 23, 17), STRAIGHT, 0.45, 10.0, 60),
+        ((19, 23, 17), np.eye(3), 0.3, 1.0, 20),
         ((40, 37, 6), np.diag([0.45, 0.45, 6.0]), 0.3, 10.0, 60),
-        ((29, 33, 27), np.eye(3), 0.3, 1e4, 100),
-        ((200, 170), np.eye(2), 0.3, 10.0, 40),
+        ((19, 23, 17), np.eye(3), 0.3, 1e4, 100),
+        ((100, 80), np.eye(2), 0.3, 10.0, 40),
     ],
 )
 def test_iterations_do_not_grow_with_the_grid(shape, linear, nu, contrast, iterations):
@@ -249,16 +239,6 @@ def test_short_axes_are_coarsened_first():
     assert np.prod(shapes[-1]) == 2
 
 
-@pytest.mark.parametrize(("shape", "linear"), SHAPES)
-def test_rows_are_long(shape, linear):
-    """The longest axis comes last, and a field comes back as the image has its axes."""
-    grid, _, _ = grid_and_oracle(shape, linear, 0.3)
-    assert grid.young.shape[2] == max(shape)
-    assert grid.in_image(grid.nodes()).shape == (*(s + 1 for s in shape), len(shape))
-    if len(shape) == 2:
-        assert grid.young.shape[1] == 1
-
-
 @kernel
 def test_interpolated_is_exact_for_linear_fields():
     grid, _, _ = grid_and_oracle((5, 4, 6), SHEARED, 0.3)
@@ -273,10 +253,11 @@ def test_interpolated_is_exact_for_linear_fields():
     np.testing.assert_allclose(interpolated(linear(half), half, grid), linear(grid), atol=1e-5)
 
 
+@pytest.mark.full
 def test_same_bits_on_any_number_of_threads():
     import numba
 
-    grid, u = big((33, 29, 31), SHEARED, 0.3, 10.0)
+    grid, u = big((23, 19, 21), SHEARED, 0.3, 10.0)
     solutions = []
     for threads in (1, numba.config.NUMBA_NUM_THREADS):
         numba.set_num_threads(threads)
@@ -290,17 +271,3 @@ def test_says_when_it_is_not_solved(monkeypatch):
     monkeypatch.setattr("tetopt.fem.voxels.ITERATION_LIMIT", 2)
     with pytest.raises(RuntimeError, match="reference: not solved, the residual is"):
         solve_voxels(grid, u)
-
-
-def test_coarse_grid_is_inverted():
-    """A grid of few unknowns is its own last one: the cycle is the solution."""
-    grid, K, is_free = grid_and_oracle((3, 2, 2), STRAIGHT, 0.3)
-    hierarchy = multigrid_of(grid)
-    assert len(hierarchy.levels) == 1
-    r = np.random.default_rng(8).normal(size=len(K)) * is_free
-    hierarchy.levels[0].r[:] = field(grid, r)
-    _cycle(hierarchy, 0)
-    free = np.flatnonzero(is_free)
-    exact = np.zeros(len(K))
-    exact[free] = np.linalg.solve(K[np.ix_(free, free)], r[free]) * grid.young.max()
-    np.testing.assert_allclose(grid.in_image(hierarchy.levels[0].x).ravel(), exact, atol=1e-4 * np.abs(exact).max())

@@ -9,16 +9,12 @@ import tetopt
 from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.manifold import manifold_part
 from tetopt.geometry.simplex import volumes
+from tetopt.start.carve import part_of
 
 
 def box(n):
     """A criss-cross square, or a cube of five-tets, of 4 blocks an edge."""
     return tetopt.lattice_mesh(tetopt.Image(np.zeros((8,) * n)), "five-tet" if n == 3 else None, blocks=(4,) * n)
-
-
-def part(mesh, is_kept):
-    used, cells = np.unique(mesh.cells[is_kept], return_inverse=True)
-    return tetopt.Mesh(mesh.points[used], cells.reshape(-1, mesh.ndim + 1))
 
 
 def kept_of(mesh):
@@ -57,9 +53,9 @@ def test_two_cavities_that_touch_in_a_node_are_joined():
     star = np.flatnonzero((mesh.cells == node).any(axis=1))
     centre = mesh.points[mesh.cells[star]].mean(axis=1) - mesh.points[node]
     holes = star[[int(np.argmax(centre.sum(axis=1))), int(np.argmin(centre.sum(axis=1)))]]
-    holed = part(mesh, ~np.isin(np.arange(len(mesh.cells)), holes))
+    holed = part_of(mesh, ~np.isin(np.arange(len(mesh.cells)), holes))
     assert any("touches itself" in line for line in manifold_problems(holed))
-    left = part(holed, kept_of(holed))
+    left = part_of(holed, kept_of(holed))
     assert manifold_problems(left) == []
     assert len(holed.cells) - len(star) < len(left.cells) < len(holed.cells)
 
@@ -69,7 +65,7 @@ def test_what_is_left_of_any_part_is_a_manifold(seed, fraction, n):
     mesh = box(n)
     is_in = np.random.default_rng(seed).random(len(mesh.cells)) < fraction
     is_in[0] = True
-    chosen = part(mesh, is_in)
+    chosen = part_of(mesh, is_in)
     is_kept = kept_of(chosen)
     assert is_kept.any()
-    assert manifold_problems(part(chosen, is_kept)) == []
+    assert manifold_problems(part_of(chosen, is_kept)) == []

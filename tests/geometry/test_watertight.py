@@ -1,7 +1,5 @@
 """Surfaces of sets of tetrahedra: closed and manifold whatever the set, around the same volume, crossing nothing."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -121,15 +119,6 @@ def test_a_whole_mesh_has_its_boundary_facets(mesh):
     assert (surface.n_parted, surface.largest_shift, n_pieces(surface)) == (0, 0.0, 1)
 
 
-def test_volume_and_area_far_from_the_origin():
-    points, cells = FIVE_TET_CUBE
-    assert volume_and_area(extract_surface(points, cells, range(5))) == pytest.approx((1.0, 6.0), rel=1e-14)
-    moved = points * 0.7 + 1e7 / 3.0
-    volume, area = volume_and_area(extract_surface(moved, cells, range(5)))
-    assert volume == pytest.approx(volumes(moved, cells).sum(), rel=1e-13)
-    assert area == pytest.approx(6.0 * 0.7**2, rel=1e-8)
-
-
 def test_mask_and_indices_in_any_order_mean_the_same():
     points, cells = grid((2, 2, 2))
     mask = np.arange(len(cells)) % 3 == 0
@@ -222,20 +211,6 @@ def test_cavities_that_share_a_node_part_into_themselves():
         assert n_crossings(surface) == 0
 
 
-def test_many_cells_that_share_one_node_all_come_apart():
-    """Every second octant around a node, and the narrowest moves farthest."""
-    corners = [np.diag(signs) for signs in product((1.0, -1.0), repeat=3) if np.prod(signs) > 0]
-    points = np.vstack(
-        [np.zeros((1, 3)), *[corner * scale for corner, scale in zip(corners, range(1, 5), strict=True)]]
-    )
-    cells = oriented(points, np.array([[0, 3 * k + 1, 3 * k + 2, 3 * k + 3] for k in range(4)]))
-    surface = extract_surface(points, cells, range(4))
-    assert_surface_of(surface, points, cells)
-    assert (surface.n_parted, n_pieces(surface)) == (1, 4)
-    near = np.sort(np.linalg.norm(surface.points, axis=1))[:4]
-    np.testing.assert_allclose(near, surface.largest_shift * np.arange(4) / 3.0, atol=1e-15)
-
-
 def test_the_shift_is_felt_in_float32_and_turns_no_cell():
     points, cells = TOUCHING
     cells = oriented(points, cells)
@@ -265,8 +240,7 @@ def test_any_cells_of_a_lattice(seed, kind, fraction):
 
 
 @pytest.mark.parametrize("kind", ["five-tet", "bcc"])
-@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.9])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("fraction", "seed"), [(0.1, 0), (0.9, 1)])
 def test_parted_sheets_do_not_cross(kind, fraction, seed):
     """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
     points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)

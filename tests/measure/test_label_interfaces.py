@@ -21,6 +21,7 @@ from tetopt.measure.interfaces import (
     voxel_euler,
 )
 from tetopt.report.tables import label_differences
+from tetopt.start.carve import part_of
 
 
 def blocky(labels, affine=None):
@@ -73,20 +74,13 @@ def test_the_outside_is_no_label_but_is_around():
     labels[0, 1, 1] = labels[0, 2, 2] = 1
     image, mesh, of_cell = blocky(labels)
     only = of_cell == 1  # the two cubes alone: the outside is all around
-    alone = tetopt.Mesh(*compact(mesh.points, mesh.cells[only]))
+    alone = part_of(mesh, only)
     assert broken(label_interfaces(image, alone, np.ones(only.sum()))[1]) == (1, 1, 0, 0)
 
 
-def compact(points, cells):
-    used, cells = np.unique(cells, return_inverse=True)
-    return points[used], cells.reshape(-1, points.shape[1] + 1)
-
-
-@pytest.mark.parametrize(
-    ("kind", "euler", "cavities"), [("ball", 2, 0), ("pieces", 4, 0), ("hole", 4, 1), ("handle", 0, 0)]
-)
+@pytest.mark.parametrize(("kind", "euler", "cavities"), [("hole", 4, 1), ("handle", 0, 0)])
 def test_euler_numbers(kind, euler, cavities):
-    """Of a ball, two, a shell, a torus; and of what is around them."""
+    """Of a shell and a torus; and of what is around them."""
     _, mask = shaped(kind, OBLIQUE)
     background, inside = label_interfaces(*blocky(mask.data, OBLIQUE))
     assert (inside.euler, inside.mesh_euler, inside.cavities, inside.mesh_cavities) == (
@@ -95,7 +89,7 @@ def test_euler_numbers(kind, euler, cavities):
         cavities,
         cavities,
     )
-    around = {"ball": (4, 1), "pieces": (6, 2), "hole": (6, 1), "handle": (2, 1)}[kind]
+    around = {"hole": (6, 1), "handle": (2, 1)}[kind]
     assert (background.euler, background.cavities) == (background.mesh_euler, background.mesh_cavities) == around
     assert broken(inside) == broken(background) == (0, 0, 0, 0)
 
@@ -114,7 +108,7 @@ def test_a_cavity_is_open_where_corners_meet():
 
 
 @pytest.mark.parametrize("n", [2, 3])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_cells_that_are_voxels_have_their_numbers(n, seed):
     """Random labels, in which everything touches everything at edges and corners."""
     rng = np.random.default_rng(seed)
@@ -158,17 +152,6 @@ def test_edges_and_nodes_against_a_slow_twin(n):
     rows = label_interfaces(image, mesh, of_cell)
     assert [broken(row) for row in rows] == [naive_counts(mesh.cells, of_cell, row.label) for row in rows]
     assert max(row.nonmanifold_edges for row in rows) >= 3
-
-
-@pytest.mark.parametrize("side", [1, 2, 4])
-def test_a_cube(side):
-    """Its area; its edges of a voxel's length are folded, its diagonals and those within a face are flat."""
-    labels = np.zeros((6, 6, 6))
-    labels[1 : 1 + side, 1 : 1 + side, 1 : 1 + side] = 1
-    row = label_interfaces(*blocky(labels, np.diag([2.0, 2.0, 2.0, 1.0])))[1]
-    assert row.area == pytest.approx(6 * (2 * side) ** 2)
-    assert row.n_facets == 12 * side**2
-    assert row.folded == pytest.approx(12 * side / (18 * side**2))
 
 
 def test_a_ball_of_cells():

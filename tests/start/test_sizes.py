@@ -23,14 +23,11 @@ def edges(mesh):
     return ends, np.linalg.norm(mesh.points[ends[:, 0]] - mesh.points[ends[:, 1]], axis=1)
 
 
-@pytest.mark.parametrize("affine", [None, OBLIQUE])
-@pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
+@pytest.mark.full
+@pytest.mark.parametrize(("shape", "affine"), [((48, 40, 44), OBLIQUE), ((90, 70), None)])
 def test_largest(shape, affine):
     """No edge of the octree is longer; of the run's, one in a hundred by 5 %. It holds cells back that would grow."""
-    if affine is not None and len(shape) == 2:
-        affine = OBLIQUE[:3, :3].copy()
-        affine[2] = 0, 0, 1
-    image, nodes = ball(*shape, affine=affine), 1500 if len(shape) == 3 else 500
+    image, nodes = ball(*shape, affine=affine), 1000 if len(shape) == 3 else 500
     free = octree_mesh(image, nodes, Sizes(longest=np.inf))
     largest = 0.65 * edges(free)[1].max()
     sizes = Sizes(longest=largest)
@@ -52,6 +49,7 @@ def test_default_largest():
     assert edges(octree_mesh(image, 1500))[1].max() <= 1.4 * 1.05 * uniform
 
 
+@pytest.mark.full
 def test_smallest():
     """No block is below it, and no edge is split below it."""
     image = ball(48, 40, 44)
@@ -74,8 +72,8 @@ def half_sized(image, size, elsewhere=0.0, stretch=1.0):
     return tetopt.Image(np.where(low < middle, size, elsewhere), image.affine @ affine)
 
 
-@pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
-@pytest.mark.parametrize("stretch", [1.0, 2.5])
+@pytest.mark.full
+@pytest.mark.parametrize(("shape", "stretch"), [((48, 40, 44), 2.5), ((90, 70), 1.0)])
 def test_targets_in_one_half(shape, stretch):
     """With 1.5 times the nodes of equilateral cells the mean edge is no longer than its target, hardly any over sqrt 2.
 
@@ -99,6 +97,7 @@ def test_targets_in_one_half(shape, stretch):
         tetopt.mesh_image(image, nodes // 3, sizes=sizes)
 
 
+@pytest.mark.full
 def test_targets_ask_for_nothing_that_is_there():
     """Where they are longer than all edges, or infinite, they say no more than that there is no bound."""
     image = ball(48, 40, 44)
@@ -108,9 +107,10 @@ def test_targets_ask_for_nothing_that_is_there():
         assert mesh.points.tobytes() == free.points.tobytes()
 
 
-@pytest.mark.parametrize("count", [150, 6000])
+@pytest.mark.full
+@pytest.mark.parametrize("count", [150, 2500])
 def test_targets_from_any_mesh(count):
-    """A lattice with a fifth of the nodes, or five times as many, ends with the number and its edges."""
+    """A lattice with a fifth of the nodes, or twice as many, ends with the number and its edges."""
     image, sizes = ball(48, 40, 44), Sizes(edge_size=6.0)
     nodes = nodes_of_sizes(image, sizes)[0]
     start = tetopt.lattice_mesh(image, nodes=count)
@@ -122,6 +122,7 @@ def test_targets_from_any_mesh(count):
     assert ratios.above < 0.03
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
 def test_targets_without_the_image(shape):
     """With k_D = 0 they are met too, by cells of as good a shape as an image's: in 3-D better, in 2-D the same."""
@@ -141,6 +142,7 @@ def test_targets_without_the_image(shape):
     assert rho > (other if len(shape) == 3 else 0.99 * other)
 
 
+@pytest.mark.full
 def test_nodes_follow_from_sizes():
     """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a field of one half."""
     image = ball(30, 30, 30)
@@ -207,6 +209,7 @@ def test_edge_ratios():
     assert edge_ratios(mesh.points, mesh.cells, Sizes(longest=5.0)) is None
 
 
+@pytest.mark.full
 def test_gradation():
     """From one small spot in an empty box sizes grow, and slowly if they are asked to."""
     shape = (64, 64, 64)
@@ -285,21 +288,15 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
     ("sizes", "words"),
     [
         (Sizes(smallest=-1.0), "smallest: expected 0 mm or more, got -1"),
-        (Sizes(smallest=float("nan")), "smallest"),
-        (Sizes(edge_size=0.0), "edge_size: expected a length above 0 mm"),
         (Sizes(edge_size=float("nan")), "edge_size: expected a length above 0 mm"),
         (Sizes(longest=0.0), "longest: expected a length above 0 mm"),
         (Sizes(smallest=5.0, longest=4.0), "longest: 4 mm is below the smallest size, 5 mm"),
         (Sizes(longest=0.3), "500 nodes are too few .* they need"),
         (Sizes(smallest=5.0, edge_size=4.0), "edge_size: 4 mm is below the smallest size, 5 mm"),
-        (Sizes(gradation=0.0), "gradation: expected 0.05"),
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
         (Sizes(field=tetopt.Image(np.ones((4, 4)))), "field: expected one in 3-D"),
         (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "field: no voxel is above 0"),
-        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "500 nodes are too few .* they need"),
         (Sizes(smallest=100.0), "smallest: 100 mm is longer than the box, 30 mm"),
-        (Sizes(smallest=1e300), "longer than the box"),
-        (Sizes(edge_size=0.3), "500 nodes are too few .* they need"),
         (Sizes(edge_size=1e-6), "500 nodes are too few .* they need"),
         (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
         (
@@ -320,49 +317,6 @@ def test_smallest_before_largest():
     """Where not both can be, the smallest is kept."""
     mesh = octree_mesh(ball(30, 30, 30), 320, Sizes(smallest=5.0, longest=5.0))
     assert edges(mesh)[1].min() >= 5.0 * (1 - 1e-9)
-
-
-def waves_in_half():
-    """A box with content in half of it, for which nodes leave the other half."""
-    data = np.zeros((40, 40, 40))
-    data[:20] = 100.0 * np.sin(grid(20, 40, 40)[..., 1] / 2.0) * np.cos(grid(20, 40, 40)[..., 2] / 3.0)
-    return tetopt.Image(data)
-
-
-def test_runs_keep_to_the_largest():
-    """From a uniform mesh: exchanges make edges no longer than allowed, and would."""
-    image = waves_in_half()
-    start = tetopt.lattice_mesh(image, nodes=1000)
-    longest = edges(start)[1].max()
-    bounded, free = (
-        edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(longest=largest)).mesh)[1]
-        for largest in (1.1 * longest, np.inf)
-    )
-    assert np.percentile(bounded, 99.5) < 1.1 * 1.05 * longest
-    assert np.percentile(free, 99.5) > 1.1 * np.percentile(bounded, 99.5)
-
-
-def test_runs_keep_to_the_smallest(monkeypatch):
-    """From a uniform mesh: edges whose halves would be shorter are not split, and would be."""
-    image = waves_in_half()
-    start = tetopt.lattice_mesh(image, nodes=1000)
-    fast = sys.modules["tetopt.engine.fast"]
-    plain, made = fast.exchange, []
-
-    def counted(*arguments):
-        done = plain(*arguments)
-        made.append(done.n_split)
-        return done
-
-    monkeypatch.setattr(fast, "exchange", counted)
-    splits = []
-    for smallest in (0.0, 0.65 * edges(start)[1].max()):
-        made.clear()
-        sizes = Sizes(smallest=smallest, longest=np.inf)
-        tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=6, sizes=sizes)
-        splits.append(sum(made))
-    assert splits[0] > 100
-    assert splits[1] < 0.1 * splits[0]
 
 
 def test_longest_at_nodes():
@@ -393,6 +347,7 @@ def test_longest_at_nodes():
 # As many nodes as an error takes.
 
 
+@pytest.mark.full
 def test_a_stop_keeps_what_has_the_error():
     """A run cut short does not replace a mesh that has the error already; without one it is what there is."""
     image = ball(40, 40, 40)
@@ -412,8 +367,8 @@ def test_a_stop_keeps_what_has_the_error():
         assert result.nodes in count
 
 
-@pytest.mark.parametrize("noise", [0.0, 3.0])
-@pytest.mark.parametrize("shape", [(60, 56, 52), (120, 100)])
+@pytest.mark.full
+@pytest.mark.parametrize(("shape", "noise"), [((40, 36, 38), 3.0), ((120, 100), 0.0)])
 def test_target_error(shape, noise):
     """Reached, without far more nodes than it takes."""
     image = ball(*shape, noise=noise)
@@ -426,6 +381,7 @@ def test_target_error(shape, noise):
     assert tetopt.check_mesh(mesh, image) == []
 
 
+@pytest.mark.full
 def test_target_error_within_limits():
     """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
     image = ball(40, 40, 40)
@@ -456,11 +412,12 @@ def test_targets_that_cannot_be(image, arguments, words):
         tetopt.mesh_image(image, **arguments)
 
 
+@pytest.mark.full
 def test_exchanges_do_not_follow_noise(monkeypatch):
     """In noise alone hardly a node is exchanged, if its level is known."""
-    image = tetopt.Image(np.random.default_rng(1).normal(0.0, 10.0, (40, 40, 40)))
+    image = tetopt.Image(np.random.default_rng(1).normal(0.0, 10.0, (32, 32, 32)))
     fast = sys.modules["tetopt.engine.fast"]
-    start = octree_mesh(image, 1500)
+    start = octree_mesh(image, 800)
     count = {}
     for known in (True, False):
         made = []
@@ -475,7 +432,7 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
             patched.setattr(fast, "exchange", counted)
             if not known:
                 patched.setattr(sys.modules["tetopt.contents.content"], "noise_level", lambda data, inside: 0.0)
-            tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=8)
+            tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=6)
         count[known] = sum(made)
-    assert count[False] > 100
+    assert count[False] > 50
     assert count[True] < 0.1 * count[False]

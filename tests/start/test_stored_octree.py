@@ -39,14 +39,14 @@ def assert_same(mesh, expected):
     np.testing.assert_array_equal(mesh.cells, expected.cells)
 
 
-# Bytes of a read, and voxels of a piece, so that boxes are cut along one axis, along both, and not at all.
-@pytest.mark.parametrize("most", [(3_000, 700), (50_000, 20_000), (2**28, 2**16)])
+# Bytes of a read, and voxels of a piece, so that boxes are cut along one axis, and along both.
+@pytest.mark.full
+@pytest.mark.parametrize("most", [(3_000, 700), (50_000, 20_000)])
 @pytest.mark.parametrize(
     ("shape", "dtype", "affine", "chunks"),
     [
         ((47, 39, 31), np.uint16, None, (7, 8, 9)),
-        ((29, 50, 41), np.int16, THICK, (64, 64, 64)),
-        ((40, 33, 45), np.float32, OBLIQUE, (1, 33, 45)),
+        ((40, 33, 45), np.float32, THICK, (1, 33, 45)),
         ((31, 37, 43), np.float64, OBLIQUE, None),
         ((36, 30, 40), np.uint8, None, ((20, 16), (30,), (13, 27))),
     ],

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import check_labels, label_channels
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
-from tetopt.system.kernel_cache import njit
 
 PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
 NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then
@@ -207,30 +206,18 @@ def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32]
 
 
 def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    once = gaussian(level, sigma)
-    return once + gaussian(level - once, sigma)
+    def gaussian(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return scipy.ndimage.gaussian_filter(values, sigma, mode="nearest", truncate=3.0)
 
-
-def gaussian(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """`scipy.ndimage.gaussian_filter` (mode "nearest", truncate 3) to the last bit, in half of its time."""
-    square = np.arange(int(3.0 * sigma + 0.5) + 1) ** 2
-    weights = np.exp(-0.5 / (sigma * sigma) * square)
-    return _correlated(level, weights / np.concatenate([weights[:0:-1], weights]).sum())
-
-
-def _correlated(data: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """`data` weighed along each axis, symmetrically, `weights` (R+1,) from the middle on; constant beyond its faces."""
-    for axis in range(data.ndim):
-        rows = np.ascontiguousarray(data).reshape(int(np.prod(data.shape[:axis])), data.shape[axis], -1)
-        out = np.empty_like(rows)
-        _correlate(out, rows, weights)
-        data = out.reshape(data.shape)
-    return data
+    once = gaussian(level)
+    return once + gaussian(level - once)
 
 
 def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
     """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`."""
-    mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, of the level that is linear between centres
+    mean = level  # over each voxel, of the level that is linear between centres
+    for axis in range(level.ndim):
+        mean = scipy.ndimage.correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
     distance = mean / np.clip(_slope(level), LEAST_SLOPE, 1.0)
     missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0), sigma)
     area = _summed((np.abs(distance) < 0.5).astype(np.float32), sigma)
@@ -383,36 +370,3 @@ def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArr
         level += np.where(side, sign * (distance - 0.5), 0.0).astype(np.float32)
         deepest += largest[piece]
     return level, deepest
-
-
-# Kernels.
-
-
-@njit(cache=True, nogil=True)
-def _correlate(out: NDArray, data: NDArray, weights: NDArray) -> None:
-    """The middle axis of `data` (A, n, B) weighed; sums in float64 and in scipy's order, for all B, or n, at once."""
-    reach, n, width = len(weights) - 1, data.shape[1], data.shape[2]
-    line, total = np.empty(n + 2 * reach), np.empty(max(n, width))
-    for a in range(data.shape[0]):
-        if width == 1:
-            for i in range(n + 2 * reach):
-                line[i] = data[a, min(max(i - reach, 0), n - 1), 0]
-            for i in range(n):
-                total[i] = line[i + reach] * weights[0]
-            for j in range(reach, 0, -1):
-                before, after = line[reach - j :], line[reach + j :]
-                for i in range(n):
-                    total[i] += (before[i] + after[i]) * weights[j]
-            for i in range(n):
-                out[a, i, 0] = total[i]
-            continue
-        for i in range(n):
-            here, row = data[a, i], out[a, i]
-            for c in range(width):
-                total[c] = here[c] * weights[0]
-            for j in range(reach, 0, -1):
-                low, high = data[a, max(i - j, 0)], data[a, min(i + j, n - 1)]
-                for c in range(width):
-                    total[c] += (np.float64(low[c]) + np.float64(high[c])) * weights[j]
-            for c in range(width):
-                row[c] = total[c]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.geometry.simplex import Cells, Points, squared_edges, volume_gradients, volumes
+from tetopt.geometry.simplex import Cells, Points, squared_edges, volumes
 from tetopt.geometry.vectors import cross, difference, dot
 from tetopt.system.kernel_cache import njit
 
@@ -56,36 +56,6 @@ def E_G(points: Points, cells: Cells) -> float:
     [0.108, 0.126]
     """
     return float(cell_E_G(points, cells).sum())
-
-
-def E_G_gradient(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Derivative of E_G by every node, connectivity fixed, (N, n) float64, mm^(n+1).
-
-    For an interior node it is 2 |Omega_i| / (n+1) (x_i - c_i), c_i the volume-weighted mean of the star's
-    circumcentres; this form needs no circumcentre, holds on the boundary too, and is finite on flat cells.
-    """
-    n = points.shape[1]
-    lengths = squared_edges(points, cells).sum(axis=1)[:, None, None]
-    corners = points[cells]
-    differences = (n + 1) * (corners - corners.mean(axis=1, keepdims=True))  # sum over k of x_i - x_k
-    v = volumes(points, cells)[:, None, None]
-    fraction = (volume_gradients(points, cells) * lengths + 2.0 * v * differences) / ((n + 1) * (n + 2))
-    return _summed_at_nodes(fraction, cells, len(points))
-
-
-def star_volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """``|Omega_i|``, the volume of the cells around each node, (N,) float64, mm^n."""
-    v = np.broadcast_to(volumes(points, cells)[:, None], cells.shape)
-    return np.bincount(cells.ravel(), weights=v.ravel(), minlength=len(points)).astype(np.float64)
-
-
-def _summed_at_nodes(fraction: NDArray[np.float64], cells: Cells, n_nodes: int) -> NDArray[np.float64]:
-    """Sum over the cells of what each gives to its nodes: (M, n+1, n) -> (N, n), in cell order."""
-    axes = [
-        np.bincount(cells.ravel(), weights=fraction[..., d].ravel(), minlength=n_nodes)
-        for d in range(fraction.shape[2])
-    ]
-    return np.stack(axes, axis=1)
 
 
 @njit(cache=True)

@@ -33,6 +33,7 @@ from tetopt.engine.loop import (
     IterationRecord,
     MeshingResult,
     Whole,
+    check_common_options,
     deadline,
     relative_movement,
 )
@@ -551,10 +552,7 @@ def check_options(
     k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None
 ) -> None:
     """InputError for an option of `optimize` out of range."""
-    if not 0.0 <= k_D < 1.0:
-        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
-    if iterations < 0:
-        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    check_common_options(k_D, iterations, boundary)
     if not 1.0 <= shape_power <= 10.0:
         raise InputError(f"shape_power: expected 1 (the paper's) to 10, got {shape_power}")
     if not 0.0 <= min_dihedral < 70.0:
@@ -563,5 +561,3 @@ def check_options(
         )
     if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
         raise InputError(f"nodes: expected a whole number above 2, or None to keep those of the mesh, got {nodes!r}")
-    if boundary not in ("slide", "fixed"):
-        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")

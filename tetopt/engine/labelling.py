@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
-from tetopt.geometry.topology import stars
+from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_FRACTION = (
@@ -147,12 +147,10 @@ def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple
     one = np.repeat(np.arange(len(labels)), across.shape[1])
     other = across.ravel()
     is_link = (other > one) & (labels[one] == labels[other])
-    linked = one[is_link], other[is_link]
-    links = scipy.sparse.coo_array((np.ones(is_link.sum(), dtype=np.int8), linked), shape=(len(labels),) * 2)
-    n_pieces, number = scipy.sparse.csgraph.connected_components(links, directed=False)
+    n_pieces, number = linked(one[is_link], other[is_link], len(labels))
     of_component = np.empty(n_pieces, dtype=np.int64)
     of_component[number] = labels
-    return number.astype(np.int64), of_component
+    return number, of_component
 
 
 def _dual(

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.labels import colours_by_number
 from tetopt.energy.sampling import SamplingGrid
+from tetopt.errors import InputError
 from tetopt.geometry.box import facets_on_sides
-from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
@@ -201,31 +201,36 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 
 def frozen_axes(
-    image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary,
-    has_surface: bool = False, shared: Facets | None = None, sides: NDArray[np.int64] | None = None,
+    ticks: NDArray[np.int64], facets_out: NDArray[np.int64], sides: NDArray[np.int64], boundary: Boundary,
+    has_surface: bool,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
 
     A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
     facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
-    surface on which such nodes slide, is marked in the last column. `shared` are the cells' facets, if known; `sides`
-    (3, 2) those of the box, if they are not the image's own.
+    surface on which such nodes slide, is marked in the last column. `facets_out` (B, n) are the boundary's facets,
+    `sides` (3, 2) the box's, in ticks.
     """
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
-    facets_out = boundary_facets(cells, shared)
     if boundary == "fixed":
         is_frozen[facets_out.ravel(), :3] = True
         return is_frozen
-    sides = side_ticks(grid) if sides is None else sides
     is_across = np.any(facets_on_sides(ticks, facets_out, sides, tolerance=0), axis=2)  # (B, 3)
     for axis in range(3):
         is_frozen[facets_out[is_across[:, axis]].ravel(), axis] = True
     elsewhere = facets_out[~np.any(is_across, axis=1)].ravel()
-    if has_surface:
-        is_frozen[elsewhere, 3] = True
-    else:
-        is_frozen[elsewhere, :3] = True
+    is_frozen[elsewhere, 3 if has_surface else slice(3)] = True
     return is_frozen
+
+
+def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
+    """InputError for an option of both engines out of range."""
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
+    if iterations < 0:
+        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    if boundary not in ("slide", "fixed"):
+        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
 
 
 def side_ticks(grid: SamplingGrid, whole: Whole | None = None) -> NDArray[np.int64]:

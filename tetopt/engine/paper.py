@@ -20,6 +20,7 @@ from tetopt.engine.loop import (
     Boundary,
     IterationRecord,
     MeshingResult,
+    check_common_options,
     deadline,
     relative_movement,
     side_ticks,
@@ -176,16 +177,11 @@ def default_n_t(k_D: float, iterations: int) -> int:
 def _check_options(
     k_D: float, iterations: int, n_t: int | None, retessellate: str, boundary: str, step_ratio: float
 ) -> None:
-    if not 0.0 <= k_D < 1.0:
-        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
-    if iterations < 0:
-        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    check_common_options(k_D, iterations, boundary)
     if n_t is not None and n_t < 0:
         raise InputError(f"n_t: expected 0 or more, got {n_t}")
     if retessellate not in ("first", "accept", "never"):
         raise InputError(f"retessellate: expected first, accept or never, got {retessellate!r}")
-    if boundary not in ("slide", "fixed"):
-        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
     if not 0.0 < step_ratio < 1.0:
         raise InputError(f"step_ratio: expected a number between 0 and 1, got {step_ratio}")
 

@@ -66,7 +66,7 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
         }
     checks: dict[str, Callable[[], dict[str, str]]] = {
         "min_dihedral": lambda: _violated_min_dihedral(result, min_dihedral),
-        "box": lambda: _beyond(result.mesh, start, content.image),
+        "box": lambda: violated_box(result.mesh, content.image, start),
         **of_domain,
         "manifold": lambda: _violated_manifold(content, result),
         "labels": lambda: _violated_labels(content, result),
@@ -82,18 +82,16 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
     return result._replace(violated=violated)
 
 
-def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
+def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[str, str]:
+    """Nodes beyond an image's box, further than those of an initial mesh, if there is one."""
     beyond = float(beyond_box(mesh, image).max())
-    allowed = max(float(beyond_box(start, image).max()), 0.0) + ON_SIDE_VOXELS
-    return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed else {}
+    allowed = 0.0 if start is None else max(float(beyond_box(start, image).max()), 0.0)
+    return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed + ON_SIDE_VOXELS else {}
 
 
 def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
     """As `checked`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
-    violated = _violated_min_dihedral(result, min_dihedral) | _violated_box(grid, result)
-    beyond = float(beyond_box(result.mesh, grid).max())
-    if beyond > ON_SIDE_VOXELS:
-        violated["box"] = BEYOND_WORDS.format(beyond)
+    violated = _violated_min_dihedral(result, min_dihedral) | _uncovered(grid, result) | violated_box(result.mesh, grid)
     return result._replace(violated=violated)
 
 
@@ -120,11 +118,11 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
             f"{fraction:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
             "cells or more iterations, or ask for a number of nodes"
         )
-    violated |= _violated_box(content.image, result) if is_filled else {}
+    violated |= _uncovered(content.image, result) if is_filled else {}
     return result._replace(violated=violated, fraction=fraction)
 
 
-def _violated_box(image: Image, result: MeshingResult) -> dict[str, str]:
+def _uncovered(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}

@@ -11,7 +11,7 @@ from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, Whole, frozen_axes, side_ticks
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
-from tetopt.geometry.topology import facets
+from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -58,8 +58,8 @@ def unweighted(
     check_unfolded(mesh, shared)
     matrix = matrix_of(image)
     own_sides = side_ticks(grid, whole)
-    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None, shared, own_sides)
-    sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level, own_sides)
+    is_frozen = frozen_axes(ticks, boundary_facets(mesh.cells, shared), own_sides, boundary, region is not None)
+    sides = sides_of(grid, matrix, own_sides, boundary == "fixed", None if region is None else region.level)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
     rounding = float(E_D_ROUNDING * content.variance / content.unit * content.n_voxels)
     wrong_side = 0.0 if region is None else float(content.wrong_side)
@@ -81,13 +81,10 @@ def content_energies(state: State, content: Content, n_means: int | None = None)
     """
     E_G, squares = energies(state, n_means)
     if content.region is not None:
-        squares += state.objective.wrong_side * n_misfits(state, content)
+        # Voxels of the mask outside of the mesh, and others inside of it.
+        n_misfits = content.n_voxels + int(state.complex.sums[: int(state.complex.n_cells[0]), -1].sum())
+        squares += state.objective.wrong_side * n_misfits
     return E_G, squares if squares > state.objective.rounding else 0.0
-
-
-def n_misfits(state: State, content: Content) -> int:
-    """Voxels of the mask outside of the mesh, and others inside of it."""
-    return content.n_voxels + int(state.complex.sums[: int(state.complex.n_cells[0]), -1].sum())
 
 
 def matrix_of(image: Image) -> NDArray[np.float64]:
@@ -98,14 +95,11 @@ def matrix_of(image: Image) -> NDArray[np.float64]:
 
 
 def sides_of(
-    grid: SamplingGrid, matrix: NDArray[np.float64], is_fixed: bool, level: NDArray[np.float32] | None = None,
-    own_sides: NDArray[np.int64] | None = None,
+    grid: SamplingGrid, matrix: NDArray[np.float64], own_sides: NDArray[np.int64], is_fixed: bool,
+    level: NDArray[np.float32] | None,
 ) -> Sides:  # fmt: skip
-    """Sides of the box of an image, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function.
-
-    `own_sides` are the box's, (3, 2) ticks, if not the image's own.
-    """
-    low, high = np.ascontiguousarray((side_ticks(grid) if own_sides is None else own_sides).T)
+    """Sides (3, 2) of a box, ticks, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function."""
+    low, high = np.ascontiguousarray(own_sides.T)
     has_surface = level is not None
     level = np.zeros((1, 1, 1), dtype=np.float32) if level is None else level.reshape(grid.shape)
     inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)

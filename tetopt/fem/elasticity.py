@@ -234,8 +234,11 @@ def order_of(mesh: Mesh, u: NDArray[np.float64]) -> int:
 # Boundary conditions
 
 
-def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes on the two faces of the image's box across an index axis: bottom and top, int64, ascending.
+def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Nodes on the bottom and the top of the image's box, int64, ascending.
+
+    These are its faces across the index axis whose direction in the world is nearest to the last world axis: z in 3-D,
+    inferior to superior, and y in 2-D.
 
     Parameters
     ----------
@@ -243,28 +246,21 @@ def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArra
         Its box runs from index -0.5 to shape - 0.5; the affine may be oblique or sheared.
     mesh : Mesh
         Nodes within 1e-6 voxel of a face are on it.
-    axis : int, optional
-        Index axis that the faces lie across. By default the one whose direction in the world is nearest to the
-        last world axis: z in 3-D, inferior to superior, and y in 2-D.
 
     Returns
     -------
     low_nodes, high_nodes
-        High is the side of the larger world coordinate, along z (y in 2-D) for the default axis, and for others
-        along the world axis that they are nearest to.
+        High is the side of the larger z (y in 2-D).
 
     Raises
     ------
     InputError
-        Another dimension, an axis that does not exist, or a face without nodes.
+        Another dimension, or a face without nodes.
     """
     n = image.ndim
     if mesh.ndim != n:
         raise InputError(f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {n}-D image")
-    upright = upright_axis(image.affine)
-    axis = upright if axis is None else axis
-    if axis not in range(n):
-        raise InputError(f"axis: expected one of 0 to {n - 1} in {n}-D, got {axis!r}")
+    axis = upright_axis(image.affine)
     index, sides = image.to_index(mesh.points), box_sides(image.shape)
     is_on = is_on_sides(index, sides)[:, axis].T  # (2, N)
     place = index[:, axis]
@@ -274,9 +270,7 @@ def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArra
                 f"mesh: no node lies on the image's face at index {side:g} of axis {axis}, the mesh runs from "
                 f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, crop and slice?"
             )
-    direction = image.affine[:n, axis]
-    runs_up = direction[n - 1 if axis == upright else np.argmax(np.abs(direction))] > 0.0
-    low, high = (np.flatnonzero(is_there) for is_there in (is_on if runs_up else is_on[::-1]))
+    low, high = (np.flatnonzero(is_there) for is_there in (is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]))
     return low, high
 
 

@@ -202,11 +202,7 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
     if len(shape) != n or any(not 1 <= c <= s for c, s in zip(shape, image.shape, strict=False)):
         raise InputError(f"averaged: expected up to {image.shape} voxels, got {shape}")
     data = block_means(image.data.astype(np.float64), shape)
-    size = np.array(image.shape) / np.array(shape)
-    wider = np.eye(n + 1)
-    wider[:n, :n] = np.diag(size)
-    wider[:n, n] = (size - 1.0) / 2.0
-    return Image(data, image.affine @ wider)
+    return _over_same_box(image, data)
 
 
 def refined(image: Image, shape: tuple[int, ...]) -> Image:
@@ -216,14 +212,19 @@ def refined(image: Image, shape: tuple[int, ...]) -> Image:
     the centres of another grid (`nearest`) take some voxels more often: MNI152 at 2 mm, looked up at 1 mm, has a mean
     modulus that is 0.6 % too high, which is as much as the errors that are measured.
     """
-    data, n = image.data, image.ndim
+    data = image.data
     parts = [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)]
     for axis, count in enumerate(parts):
         data = np.repeat(data, count, axis=axis)
-    smaller = np.eye(n + 1)
-    smaller[:n, :n] = np.diag(1.0 / np.array(parts))
-    smaller[:n, n] = (1.0 / np.array(parts) - 1.0) / 2.0
-    return Image(data, image.affine @ smaller)
+    return _over_same_box(image, data)
+
+
+def _over_same_box(image: Image, data: NDArray) -> Image:
+    """The image of other voxels that fill the same box."""
+    n, size = image.ndim, np.array(image.shape) / np.array(data.shape)
+    scaling = np.diag([*size, 1.0])
+    scaling[:n, n] = (size - 1.0) / 2.0
+    return Image(data, image.affine @ scaling)
 
 
 def nearest(image: Image, grid: Image) -> Image:

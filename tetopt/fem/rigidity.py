@@ -13,11 +13,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import block_array, coo_array, csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 
 from tetopt.errors import InputError
-from tetopt.geometry.topology import components
+from tetopt.geometry.topology import components, linked
 
 # The squared violation of all holds by a rigid motion of size 1: below this, which is rounding, nothing holds it.
 LOOSE_VIOLATION = 1e-11
@@ -79,12 +78,8 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
 def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
     """InputError if a connected component of the mesh, cells linked by nodes, has no prescribed dof."""
     n_bodies = int(body.max()) + 1
-    touches = coo_array(
-        (np.ones(cells.size, dtype=np.int8), (cells.ravel(), np.repeat(body, cells.shape[1]) + len(is_prescribed))),
-        shape=(len(is_prescribed) + n_bodies,) * 2,
-    )
-    _, label = connected_components(touches, directed=False)
-    label = label[: len(is_prescribed)]
+    bodies = np.repeat(body, cells.shape[1]) + len(is_prescribed)
+    label = linked(cells.ravel(), bodies, len(is_prescribed) + n_bodies)[1][: len(is_prescribed)]
     is_held = np.isin(label, label[is_prescribed.any(axis=1)])
     loose = np.flatnonzero(~is_held[cells[:, 0]])
     if len(loose):

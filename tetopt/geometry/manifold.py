@@ -13,11 +13,10 @@ from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
-from tetopt.geometry.topology import Facets, facets, stars
+from tetopt.geometry.topology import Facets, facets, linked, stars
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -102,9 +101,7 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
     by_ridge = np.argsort(ridges.of_facet.ravel(), kind="stable")
     ridge, ends = ridges.of_facet.ravel()[by_ridge], corner.reshape(-1, n - 1)[by_ridge]
     is_same = ridge[1:] == ridge[:-1]
-    link = (ends[:-1][is_same].ravel(), ends[1:][is_same].ravel())
-    graph = scipy.sparse.coo_array((np.ones(len(link[0]), dtype=np.int8), link), shape=(surfaces.nodes.size,) * 2)
-    n_fans, fan = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    n_fans, fan = linked(ends[:-1][is_same].ravel(), ends[1:][is_same].ravel(), surfaces.nodes.size)
     base = int(surfaces.nodes.max(initial=0)) + 1
     key = np.empty(n_fans, dtype=np.int64)
     key[fan] = ((surfaces.label[:, None] - OUTSIDE_LABEL) * base + surfaces.nodes).ravel()

@@ -24,9 +24,14 @@ def cell_edges(n: int) -> NDArray[np.int64]:
     return QUADRATIC_EDGES[: n * (n + 1) // 2]
 
 
+def edge_ends(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The edges of cells (M, n+1), (M, 3 or 6, 2), each with the lower node first."""
+    return np.sort(cells[:, cell_edges(cells.shape[1] - 1)], axis=2)
+
+
 def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The edges (E, 2) of cells (M, n+1), sorted by their ends; and of each cell the numbers (M, 3 or 6) of its own."""
-    ends = np.sort(cells[:, cell_edges(cells.shape[1] - 1)], axis=2)
+    ends = edge_ends(cells)
     n_nodes = int(cells.max()) + 1
     # As single numbers: ten times faster than as pairs, at 112,000 tetrahedra.
     keys, number = np.unique(ends[..., 0] * n_nodes + ends[..., 1], return_inverse=True)

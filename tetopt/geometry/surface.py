@@ -12,12 +12,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
-from tetopt.geometry.topology import Facets, facets
+from tetopt.geometry.topology import Facets, facets, linked
 
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -224,7 +223,7 @@ def _walks(
         steps.append(shared.of_cell[near][:, [k, m]] * len(crowded) + at[is_at, None])
     state, step = np.unique(np.vstack(steps), return_inverse=True)
     one, other = step.reshape(-1, 2).T
-    return _connected(one, other, len(state))[np.searchsorted(state, facet * len(crowded) + edge)]
+    return linked(one, other, len(state))[1][np.searchsorted(state, facet * len(crowded) + edge)]
 
 
 def _inner_angles(
@@ -249,7 +248,7 @@ def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
     """The fan of each corner, (3K,), numbered from 0: the corners that one meets turning about a node."""
     corner = np.arange(len(partner))
     before = corner - corner % 3 + (corner + 2) % 3
-    return _connected(corner, partner[before], len(corner))
+    return linked(corner, partner[before], len(corner))[1]
 
 
 def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
@@ -363,9 +362,3 @@ def _with_middles(
 def _pair_key(one: NDArray[np.int64], other: NDArray[np.int64], base: int) -> NDArray[np.int64]:
     """One number for two numbers below `base`, whatever their order."""
     return np.minimum(one, other) * base + np.maximum(one, other)
-
-
-def _connected(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Number of the connected set of each of n things, (n,), where one[i] and other[i] are linked."""
-    graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)

@@ -131,6 +131,13 @@ def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArr
     return colours
 
 
+def linked(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
+    """How many connected sets n things fall into, of which one[i] and other[i] are linked, and each thing's, (n,)."""
+    graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    count, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return int(count), number.astype(np.int64)
+
+
 def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     """Number of the connected set each cell belongs to, (M,) int64; cells that share a facet are connected.
 
@@ -138,9 +145,7 @@ def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     """
     sides = facets(cells).cells
     sides = sides[sides[:, 1] >= 0]
-    ones = np.ones(len(sides), dtype=np.int8)
-    graph = scipy.sparse.coo_array((ones, (sides[:, 0], sides[:, 1])), shape=(len(cells),) * 2)
-    _, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    _, number = linked(sides[:, 0], sides[:, 1], len(cells))
     _, first, inverse = np.unique(number, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

@@ -391,27 +391,12 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
 
 
 def surface_distances(
-    points: NDArray[np.float64], surface_points: NDArray[np.float64], surface_facets: NDArray[np.int64]
+    points: NDArray[np.float64], surface: FacetSurface, is_flat: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit; exact.
 
-    The surface is `surface_points` (P, n) with triangles (T, 3), or segments (T, 2) in the plane; flat ones count.
-
-    Raises
-    ------
-    InputError
-        A surface without facets.
+    The surface has one facet or more; `is_flat` (T,) are those without an area, which count, too.
     """
-    if len(surface_facets) == 0:
-        raise InputError("surface: expected one facet or more, got none; nothing has a distance from it")
-    surface = FacetSurface(surface_points, surface_facets)
-    return _distances_from(points, surface, _areas_and_flat(surface)[1])
-
-
-def _distances_from(
-    points: NDArray[np.float64], surface: FacetSurface, is_flat: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """As `surface_distances`, of a surface of whose facets it is known which are flat."""
     import pyvista
     from vtkmodules.vtkCommonCore import mutable
     from vtkmodules.vtkCommonDataModel import vtkGenericCell, vtkStaticCellLocator
@@ -536,7 +521,7 @@ def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDA
     density = min(max(POINTS_PER_FACE / face, FEWEST_POINTS / largest), MOST_POINTS / largest)
     spread = evenly_spread(one, max(ceil(density * total), 1), areas)
     spread_there = evenly_spread(other, max(ceil(density * total_there), 1), areas_there)
-    return _distances_from(spread, other, is_flat_there), _distances_from(spread_there, one, is_flat)
+    return surface_distances(spread, other, is_flat_there), surface_distances(spread_there, one, is_flat)
 
 
 def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:

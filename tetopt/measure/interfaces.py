@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.labels import check_labels
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
-from tetopt.geometry.simplex import edge_pairs
-from tetopt.geometry.topology import Facets, facets
+from tetopt.geometry.quadratic import edge_ends
+from tetopt.geometry.topology import Facets, facets, linked
 from tetopt.image import Image, transformed
 from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, surface_areas
 from tetopt.mesh import Mesh
@@ -275,7 +275,7 @@ def _cell_eulers(
     nodes = np.unique(of_cell[:, None] * base + cells) // base
     total -= (-1) ** (n + 1) * (np.bincount(nodes, minlength=n_labels) - n_nodes)
     if n == 3:
-        ends = np.sort(cells[:, np.array(edge_pairs(n))], axis=2)
+        ends = edge_ends(cells)
         edges = np.unique((of_cell[:, None] * base + ends[..., 0]) * base + ends[..., 1]) // base**2
         total += np.bincount(edges, minlength=n_labels) - n_ridges
     return 2 * total
@@ -289,7 +289,7 @@ def _cell_cavities(
     if cells.shape[1] == 3:
         return cavities
     near, far = shared.cells[(shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] == of_cell[shared.cells[:, 1]])].T
-    n_pieces, piece = _parts(near, far, len(cells))
+    n_pieces, piece = linked(near, far, len(cells))
     of_piece = np.empty(n_pieces + 1, dtype=np.int64)
     of_piece[piece], of_piece[n_pieces] = of_cell, OUTSIDE_LABEL
     boundary = np.unique(shared.nodes[shared.n_cells == 1])
@@ -305,13 +305,6 @@ def _cell_cavities(
     for label in np.unique(of_cell):
         is_around = of_piece != label
         is_link = is_around[one] & is_around[other]
-        _, part = _parts(one[is_link], other[is_link], n_pieces + 1)
+        _, part = linked(one[is_link], other[is_link], n_pieces + 1)
         cavities[label] = len(np.unique(part[is_around])) - 1
     return cavities
-
-
-def _parts(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
-    """How many connected sets n things fall into, of which one[i] and other[i] are linked, and each thing's."""
-    graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    count, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    return int(count), part.astype(np.int64)

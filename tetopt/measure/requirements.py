@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content
 from tetopt.energy.discretization import content_E_D
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.requirements import BEYOND_WORDS, checked, requested
-from tetopt.geometry.box import ON_SIDE_VOXELS
-from tetopt.geometry.check import beyond_box
+from tetopt.engine.requirements import checked, requested, violated_box
 from tetopt.mesh import Mesh
 
 
@@ -53,7 +51,5 @@ def judged(
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
     result = checked(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
     result = requested(result, content, target_error, is_filled)
-    beyond = float(beyond_box(mesh, content.image).max())
-    if (is_filled or content.region is not None) and beyond > ON_SIDE_VOXELS:
-        return result._replace(violated={**result.violated, "box": BEYOND_WORDS.format(beyond)})
-    return result
+    beyond = violated_box(mesh, content.image) if is_filled or content.region is not None else {}
+    return result._replace(violated={**result.violated, **beyond})

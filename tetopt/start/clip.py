@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tetopt.contents.domain import ON_SURFACE_VOXELS, Region, levels
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, is_on_sides
+from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -70,17 +71,11 @@ def lattice_within(
     return nearest[0]
 
 
-def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The cells' edges, (M, E, 2), each with the lower node first."""
-    pairs = np.array([(i, j) for i in range(cells.shape[1]) for j in range(i)])
-    return np.sort(cells[:, pairs], axis=2)
-
-
 def _snapped(
     index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Nodes that are near to the surface along an edge put on it, unless that flattens a cell."""
-    edge = _edges(cells).reshape(-1, 2)
+    edge = edge_ends(cells).reshape(-1, 2)
     a, b = level[edge].T
     crosses = a * b < 0.0
     edge, part = edge[crosses], a[crosses] / (a[crosses] - b[crosses])
@@ -159,7 +154,7 @@ def _cut(
     In each round every cell is split at the first of its crossing edges, in an order that is the same for all cells,
     so that two of them always cut the facet between them alike.
     """
-    edge = _edges(cells).reshape(-1, 2)
+    edge = edge_ends(cells).reshape(-1, 2)
     edge = np.unique(edge[level[edge].prod(axis=1) < 0.0], axis=0)
     if len(edge) == 0:
         return index, level, cells
@@ -168,7 +163,7 @@ def _cut(
     level = np.append(level, np.zeros(len(edge)))
     code = edge[:, 0] * n_nodes + edge[:, 1]
     while True:
-        of_cell = _edges(cells)
+        of_cell = edge_ends(cells)
         crosses = level[of_cell].prod(axis=2) < 0.0
         is_cut = crosses.any(axis=1)
         if not is_cut.any():
