@@ -466,3 +466,77 @@ def test_a_mesh_in_other_units_is_refused(function):
     assert function(image, Mesh(mesh.points + 2.0**20 - 8, mesh.cells)) is not None
     with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* in the same mm\?"):
         function(image, Mesh(mesh.points + 2.0**21, mesh.cells))
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "blocks"),
+    [
+        ((6, 6), "criss-cross", (3, 3)),
+        ((7, 5), "criss-cross", (2, 5)),
+        ((4, 4, 4), "bcc", (2, 2, 2)),
+        ((4, 4, 4), "five-tet", (2, 2, 2)),
+        ((5, 3, 4), "bcc", (1, 1, 2)),
+        ((3, 3, 3), "bcc", (3, 3, 3)),
+        ((3, 2, 3), "five-tet", (3, 2, 3)),
+        ((2, 2, 2), "bcc", (3, 3, 3)),  # blocks under a voxel
+    ],
+)
+def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
+    image = Image(np.zeros(shape))
+    mesh = lattice_mesh(image, kind, blocks=blocks)
+    owner = cell_of_voxel(image, mesh)
+    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert (owner >= 0).all()
+
+
+@pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
+@pytest.mark.parametrize("seed", range(3))
+def test_counts_on_jittered_lattices(n, kind, seed):
+    """Hundreds of cells, oblique voxels of unequal edges, interior nodes moved by up to a tenth of a block."""
+    rng = np.random.default_rng(seed)
+    shape = tuple(int(s * SMALL) for s in (40, 36, 50))[:n] if n == 2 else tuple(int(s * SMALL) for s in (20, 18, 26))
+    blocks = (6, 5) if n == 2 else (3, 3, 4)
+    image = random_image(rng, shape, random_affine(rng, n))
+    mesh = lattice_mesh(image, kind, blocks=blocks)
+    index = image.to_index(mesh.points)
+    is_inside = ((index > -0.4) & (index < np.array(shape) - 0.6)).all(axis=1, keepdims=True)
+    index = index + is_inside * rng.uniform(-0.1, 0.1, index.shape) * np.array(shape) / blocks
+    mesh = placed(image, index, mesh.cells)
+    assert cell_moments(image, mesh).n_voxels.sum() == image.data.size
+    assert (cell_of_voxel(image, mesh) >= 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_float32_and_float64_give_the_same(dtype):
+    """In float32 values are stored, not summed."""
+    rng = np.random.default_rng(7)
+    data = rng.integers(0, 4096, (9, 9, 9)) / 16
+    image = Image(data.astype(dtype))
+    stored = Image(data)
+    object.__setattr__(stored, "data", data.astype(dtype))
+    mesh = placed(image, *split_box(rng, data.shape, 6))
+    owner = cell_of_voxel(stored, mesh)
+    for cell, (count, mean, variance) in enumerate(zip(*cell_moments(stored, mesh), strict=True)):
+        if count:
+            assert mean == pytest.approx(data[owner == cell].mean(), rel=1e-13)
+            assert variance == pytest.approx(data[owner == cell].var(), rel=1e-11, abs=1e-10)
+
+
+def test_a_mesh_beside_the_image_holds_nothing():
+    image = Image(np.arange(27.0).reshape(3, 3, 3))
+    mesh = lattice_mesh(image, blocks=(1, 1, 1))
+    moved = Mesh(mesh.points + np.array([10.0, 0, 0]), mesh.cells)
+    moments = cell_moments(image, moved)
+    assert moments.n_voxels.tolist() == [0] * 12
+    assert (moments.mean >= 18).all()  # the values at the border i = 2
+    assert (cell_of_voxel(image, moved) == -1).all()
+
+
+def test_a_flip_of_the_array_flips_the_owners_of_a_generic_mesh():
+    rng = np.random.default_rng(4)
+    image = random_image(rng, (7, 6, 5))
+    mesh = placed(image, *delaunay_box(rng, image.shape, 10))
+    flip = np.diag([-1.0, 1, 1, 1])
+    flip[0, 3] = 6
+    flipped = Image(image.data[::-1], flip)
+    np.testing.assert_array_equal(cell_of_voxel(flipped, mesh)[::-1], cell_of_voxel(image, mesh))

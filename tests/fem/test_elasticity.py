@@ -624,3 +624,84 @@ def test_messages_of_box_faces():
     assert words.startswith(
         "mesh: no node lies on the image's face at index 0.5 of axis 2, the mesh runs from -0.5 to 0"
     )
+
+
+def test_one_modulus_for_all():
+    mesh = random_mesh(np.random.default_rng(2), 2)
+    assert (stiffness(mesh, 3.0, 0.3) != stiffness(mesh, np.full(len(mesh.cells), 3.0), 0.3)).nnz == 0
+
+
+@given(seeds, dimensions)
+def test_strains_of_a_linear_field(seed, n):
+    rng = np.random.default_rng(seed)
+    mesh = random_mesh(rng, n)
+    slope = rng.normal(size=(n, n))
+    strain = strains(mesh, mesh.points @ slope.T)
+    np.testing.assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
+    np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+@pytest.mark.parametrize("sides", [(4.0, 5.0), (4.0, 3.0, 5.0)])
+def test_two_moduli_side_by_side_between_smooth_plates(sides, nu):
+    """Columns of one strain: 1/2 eps^2 (E_1 V_1 + E_2 V_2), whatever nu, since both widen alike."""
+    image, mesh = block(sides, (4,) * len(sides), None if len(sides) == 2 else "five-tet")
+    is_left = mesh.points[mesh.cells].mean(axis=1)[:, 0] < sides[0] / 4.0
+    pressed = squeezed(mesh, image, np.where(is_left, 1.0, 10.0), nu, is_bonded=False)
+    expected = 0.5 * 0.01**2 * np.prod(sides) * (0.25 * 1.0 + 0.75 * 10.0)
+    assert pressed.strain_energy == pytest.approx(expected, rel=1e-11)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_pure_shear_of_one_block(n):
+    """Every node is held, so there is nothing to solve: 1/2 mu gamma^2 V."""
+    image, mesh = block((1.0, 2.0, 3.0)[:n], (1,) * n, None if n == 2 else "five-tet")
+    push = np.zeros(n)
+    push[0] = 0.1
+    low, high = box_faces(image, mesh)
+    if n == 2:  # its centre is free: hold it, too, where the shear takes it
+        mesh = Mesh(mesh.points[:4], [[low[0], low[1], high[1]], [low[0], high[1], high[0]]])
+    pressed = compression(mesh, 5.0, 0.25, fixed_nodes=high, pushed_nodes=low, displacement=push)
+    assert len(pressed.system.free) == 0
+    height, volume = mesh.points[:, -1].max(), volumes(mesh.points, mesh.cells).sum()
+    assert pressed.strain_energy == pytest.approx(0.5 * 2.0 * (0.1 / height) ** 2 * volume, rel=1e-13)
+
+
+@pytest.mark.parametrize("is_bonded", [True, False])
+@pytest.mark.parametrize("n", [2, 3])
+def test_scaling(n, is_bonded):
+    """Energy is linear in the moduli, quadratic in the push; a mesh s times as large at equal strain has s^n of it."""
+    rng = np.random.default_rng(4)
+    image, mesh = block((1.0, 2.0, 3.0)[:n], (2,) * n)
+    young = rng.uniform(1.0, 9.0, len(mesh.cells))
+    low, high = box_faces(image, mesh)
+    push = np.array([0.1, -0.2, 0.3])[:n]
+
+    def energy(size=1.0, factor=1.0, push=push):
+        scaled = Mesh(size * mesh.points, mesh.cells)
+        return compression(
+            scaled, factor * young, 0.45, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded
+        ).strain_energy
+
+    base = energy()
+    assert energy(factor=7.0) == pytest.approx(7.0 * base, rel=1e-10)
+    assert energy(push=-3.0 * push) == pytest.approx(9.0 * base, rel=1e-10)
+    assert energy(size=5.0, push=5.0 * push) == pytest.approx(5.0**n * base, rel=1e-10)
+    assert energy(size=5.0) == pytest.approx(5.0 ** (n - 2) * base, rel=1e-10)
+
+
+def test_holding_more_and_stiffening_take_more_energy():
+    """Smooth plates allow all that bonded ones do; a stiffer cell anywhere costs; nu narrows what is free."""
+    rng = np.random.default_rng(9)
+    image, mesh = block((2.0, 3.0, 2.5), (3, 3, 3))
+    young = rng.uniform(1.0, 9.0, len(mesh.cells))
+    bonded = squeezed(mesh, image, young, 0.4).strain_energy
+    assert squeezed(mesh, image, young, 0.4, is_bonded=False).strain_energy < 0.99 * bonded
+    for cell in rng.choice(len(mesh.cells), 5, replace=False):
+        stiffer = young.copy()
+        stiffer[cell] *= 2.0
+        assert squeezed(mesh, image, stiffer, 0.4).strain_energy > bonded * (1.0 + 1e-6)
+    # Voigt and Reuss: between smooth plates the energy lies between those of equal stress and equal strain.
+    v = volumes(mesh.points, mesh.cells) / 15.0
+    smooth = squeezed(mesh, image, young, 0.0, is_bonded=False).strain_energy / (0.5 * 0.01**2 * 15.0)
+    assert 1.0 / (v / young).sum() < smooth < (v * young).sum()

@@ -18,11 +18,11 @@ from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import compression, constrained, gauss_strains, multigrid, solved, strains
 from tetopt.fem.solution import node_means, solution_fields, solve, von_mises
 from tetopt.geometry.quadratic import quadratic
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.simplex import oriented, volumes
 from tetopt.model.build import build_model
 from tetopt.model.loads import Load, facet_weights
 from tetopt.model.model import element_facets, in_units
-from tetopt.model.sets import Sets, box_of, nodes_of, standard_sets
+from tetopt.model.sets import Sets, boundary_rows, box_of, facet_triples, nodes_of, standard_sets
 
 BOTH = [(n, order) for n in (2, 3) for order in (1, 2)]
 
@@ -541,6 +541,8 @@ CHILD = """
 import hashlib
 import numpy as np
 import tetopt
+from tetopt.model.sets import Sets, boundary_rows, box_of, facet_triples, nodes_of, standard_sets
+from tetopt.geometry.simplex import oriented, volumes
 from tetopt.fem.solution import solution_fields, solve
 from tetopt.model.build import build_model
 
@@ -564,3 +566,84 @@ def test_the_same_bits_on_any_number_of_blas_threads():
         done = subprocess.run(words, env=environment, capture_output=True, check=True, text=True)
         results.add(done.stdout)
     assert len(results) == 1
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_hollow_sphere_under_pressure_from_within(order):
+    """Lame's solution: u_r = p a^3 / (E (b^3 - a^3)) ((1 - 2 nu) r + (1 + nu) b^3 / (2 r^2)), and its stresses.
+
+    An eighth of it, held across the three planes of symmetry. Facets are flat, which quadratic cells do not change:
+    their error falls with the square of the facets' size.
+    """
+    inner, outer, young, nu, pressure = 1.0, 2.0, 3.0, 0.45, 0.2
+    loads = ["move:x:0,free,free", "move:y:free,0,free", "move:z:free,free,0", f"pressure:inner:{pressure}"]
+    factor = pressure * inner**3 / (outer**3 - inner**3)
+    errors = []
+    for blocks in (4, 8):
+        mesh, sets = eighth_of_a_shell(inner, outer, blocks, blocks // 2)
+        model = build_model(mesh, young=young, nu=nu, loads=loads, known_sets=sets)._replace(order=order)
+        solution = solve(model)
+        r = np.linalg.norm(mesh.points, axis=1)
+        along = factor / young * ((1.0 - 2.0 * nu) * r + (1.0 + nu) * outer**3 / (2.0 * r**2))
+        errors.append(np.abs((solution.u[: len(r)] * mesh.points).sum(axis=1) / r - along).max() / along.max())
+    assert errors[1] < (0.04 if order == 2 else 0.5)
+    assert errors[0] / errors[1] > (3.0 if order == 2 else 1.5)
+    # The trace of the stress is the same everywhere.
+    trace_of = np.einsum("cqii->cq", solution.stress)
+    assert trace_of.mean() == pytest.approx(3.0 * factor, rel=0.03 if order == 2 else 0.4)
+
+
+def eighth_of_a_shell(inner, outer, around, across):
+    """An eighth of a hollow sphere, and its sides as sets: the lattice of a triangle times the radii."""
+    corners = [(i, j) for i in range(around + 1) for j in range(around + 1 - i)]
+    number = {corner: k for k, corner in enumerate(corners)}
+    flat = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in corners if i + j < around]
+    flat += [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in corners if i + j < around - 1]
+    directions = np.array([(around - i - j, i, j) for i, j in corners], dtype=float)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = inner * (outer / inner) ** (np.arange(across + 1) / across)
+    points = (radii[:, None, None] * directions).reshape(-1, 3)
+    cells, size = [], len(corners)
+    for layer in range(across):
+        for a, b, c in (sorted(triangle) for triangle in flat):  # prisms cut alike on the sides that they share
+            low, high = layer * size, (layer + 1) * size
+            cells += [[low + a, low + b, low + c, high + c], [low + a, low + b, high + b, high + c],
+                      [low + a, high + a, high + b, high + c]]  # fmt: skip
+    mesh = Mesh(points, oriented(points, np.array(cells)))
+    rows = boundary_rows(mesh)
+    triples = mesh.points[facet_triples(mesh.cells, rows)]
+    distance = np.linalg.norm(triples, axis=2)
+    sides = {"inner": (distance < inner + 1e-9).all(axis=1), "outer": (distance > outer - 1e-9).all(axis=1)}
+    sides |= {"xyz"[d]: (np.abs(triples[:, :, d]) < 1e-12).all(axis=1) for d in range(3)}
+    assert sum(each.sum() for each in sides.values()) == len(rows)
+    return mesh, Sets({name: rows[is_on] for name, is_on in sides.items()}, {})
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_confined_plate_under_pressure(n, order):
+    """Sides held sideways: strain p (1 + nu)(1 - 2 nu) / (E (1 - nu)), in plane stress p (1 - nu^2) / E."""
+    mesh, sets = bar(n)
+    young, nu, pressure = 3.0, 0.4, 0.5
+    loads = ["move:left:0,free,free", "move:right:0,free,free", "move:inferior:free,free,0"]
+    loads += ["move:posterior:free,0,free", "move:anterior:free,0,free"] if n == 3 else []
+    model = model_with(mesh, sets, [*loads, f"pressure:superior:{pressure}"], order, young=young, nu=nu)
+    solution = solve(model)
+    compliance = (1.0 - nu**2) / young if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu) / (young * (1.0 - nu))
+    expected = np.zeros_like(solution.u)
+    expected[:, -1] = -compliance * pressure * nodes_of_order(mesh, order)[:, -1]
+    np.testing.assert_allclose(solution.u, expected, atol=1e-12)
+    wall = solution.reactions[words_of(["hold:left"], n)[0][5:]]
+    sideways = nu if n == 2 else nu / (1.0 - nu)  # of the pressure
+    np.testing.assert_allclose(wall[0], sideways * pressure * 6.0 * 2.0 ** (n - 2), rtol=1e-10)
+
+
+def test_near_incompressible_cells_of_order_1_lock():
+    loads = ["hold:inferior", "traction:superior:0.1,0,0"]
+    mesh, sets = bar(3)
+    moved = {
+        (order, nu): np.abs(solve(model_with(mesh, sets, loads, order, young=4.0, nu=nu)).u).max()
+        for order in (1, 2) for nu in (0.3, 0.499)
+    }  # fmt: skip
+    assert moved[2, 0.499] > 0.75 * moved[2, 0.3]
+    assert moved[1, 0.499] < 0.6 * moved[1, 0.3]
