@@ -541,8 +541,6 @@ CHILD = """
 import hashlib
 import numpy as np
 import tetopt
-from tetopt.model.sets import Sets, boundary_rows, box_of, facet_triples, nodes_of, standard_sets
-from tetopt.geometry.simplex import oriented, volumes
 from tetopt.fem.solution import solution_fields, solve
 from tetopt.model.build import build_model
 
