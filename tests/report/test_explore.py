@@ -143,15 +143,6 @@ def test_refusals(mesh, image):
             exhibit(mesh, {}, facet_sets={"top": np.full((1, 3), node)})
 
 
-def test_the_colour_map_is_even():
-    """Its lightness rises by equal steps, as Y^(1/3) of its luminance says."""
-    linear = np.where(colour_table() / 255 <= 0.04045, colour_table() / 255 / 12.92, 0)
-    linear = np.where(linear > 0, linear, ((colour_table() / 255 + 0.055) / 1.055) ** 2.4)
-    lightness = np.cbrt(linear @ [0.2126, 0.7152, 0.0722])
-    steps = np.diff(lightness[::15])
-    assert steps.min() > 0.6 * steps.mean()
-
-
 # What a user does, and what the page then says or shows.
 PROBE = """<script>
 const said = {};

@@ -25,6 +25,7 @@ from tetopt.report.page import (
 from tetopt.report.viewer import View, views_html
 from tetopt.study.paper_files import _write_page
 
+pytestmark = pytest.mark.deep
 RAN = "document.documentElement.dataset.xss=1"
 
 
