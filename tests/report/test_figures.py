@@ -69,7 +69,7 @@ def image_steps(image, view):
     return image.spacing[view.axes]
 
 
-ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)]
+ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]  # of 48
 
 
 def bent(image, blocks):
@@ -102,7 +102,7 @@ def contains(polygon, point):
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
 @pytest.mark.parametrize("normal", [0, 1, 2])
 def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
-    """All 48 orientations, sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
+    """Sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
     image = oriented_image(worlds, signs)
     view = SliceView(image, axis=worlds.index(normal), index=3)
     horizontal, vertical = (w for w in range(3) if w != normal)
@@ -114,30 +114,6 @@ def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     assert np.ptp(place[:, normal]) == 0.0
     np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
     np.testing.assert_allclose(view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view))
-
-
-@pytest.mark.parametrize(
-    ("name", "worlds", "signs"),
-    [
-        ("RAS", (0, 1, 2), (1, 1, 1)),
-        ("LAS", (0, 1, 2), (-1, 1, 1)),
-        ("LPS", (0, 1, 2), (-1, -1, 1)),
-        ("PIR", (1, 2, 0), (-1, -1, 1)),
-    ],
-)
-def test_a_bright_voxel_in_the_axial_picture(name, worlds, signs):
-    """It is in the patient's right front, so right and up in the picture."""
-    image = oriented_image(worlds, signs)
-    view = SliceView(image, None, None)
-    assert view.letters == ["LR", "PA"]
-    centre = image.to_world((np.array(SHAPE) - 1) / 2)
-    step = np.array([SPACING[worlds.index(w)] for w in range(2)])
-    index = np.rint(image.to_index(centre + np.array([2 * step[0], step[1], 0.0]))).astype(int)
-    data = np.zeros(SHAPE)
-    data[tuple(index)] = 1.0
-    bright = SliceView(Image(data, image.affine), None, index[view.across]).pixels
-    middle = (np.array(bright.shape) - 1) // 2
-    assert np.argwhere(bright == 1.0).tolist() == [[middle[0] + 2, middle[1] + 1]]
 
 
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
@@ -199,7 +175,7 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("kind", ["bcc", "five-tet", "bent"])
-@pytest.mark.parametrize("affine", [np.eye(4), np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["1mm", "flip", "oblique"])
+@pytest.mark.parametrize("affine", [np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["flip", "oblique"])
 def test_a_section_tiles_the_slice(affine, kind, axis):
     image = noise((8, 9, 10), affine)
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
@@ -275,12 +251,6 @@ def test_letters_stand_on_their_sides():
         assert axes.get_aspect() == 1.0
 
 
-def test_a_constant_slice_can_be_drawn(tmp_path):
-    image = Image(np.full((6, 7), 3.0))
-    save_figure(slice_figure(image, [("", lattice_mesh(image, blocks=(2, 2)))]), tmp_path / "a.png", dpi=40)
-    assert np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L")).std() > 5.0
-
-
 def lower_part(image, axis, count):
     """A lattice that covers the first `count` voxels along an axis only."""
     part = np.take(image.data, range(count), axis=axis)
@@ -297,12 +267,6 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
         np.testing.assert_allclose([polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
     assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED_COLOUR)
-
-
-def test_a_slice_beside_the_mesh_is_empty():
-    image = noise(SHAPE)
-    figure = slice_figure(image, [("part", lower_part(image, 2, 3))], axis=2, index=7)
-    assert [len(collections(axes)[0].get_paths()) for axes in figure.axes] == [0, 0]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -381,7 +345,7 @@ def blocks_of_labels(n_labels, worlds=(0, 1, 2), signs=(1, 1, 1)):
     return Image(np.repeat(np.arange(n_labels), 2)[:, None, None] + np.zeros((1, 7, 9)), affine)
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::7])
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     labels = blocks_of_labels(4, worlds, signs)
     mesh = bent(labels, (3, 3, 2))
@@ -401,7 +365,7 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::11])
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 def test_interfaces_are_drawn_over_the_image(worlds, signs):
     """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as these are."""
     labels = blocks_of_labels(4, worlds, signs)
@@ -472,7 +436,7 @@ def lines(axes):
     return [np.array(c.get_segments()) for c in axes.collections if isinstance(c, LineCollection)]
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::5])
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     """The mesh covers just the voxels of the mask, which ends in a plane: both lines are where the pixels change."""
     image = oriented_image(worlds, signs)
@@ -491,14 +455,6 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
             assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(figure.axes[0].get_ylim()[1])
 
 
-def test_boundary_of_a_plane_mesh():
-    image = noise((6, 7))
-    mask = Image(np.arange(6)[:, None] < 4.0 + np.zeros(7), image.affine)
-    outline, boundary = lines(boundary_figure(image, mask, lower_part(image, 0, 4)).axes[0])
-    np.testing.assert_allclose(outline[..., 0], 4.0)
-    np.testing.assert_allclose(boundary[..., 0], 4.0)
-
-
 @pytest.mark.parametrize("index", range(7))
 def test_a_closed_boundary_is_closed_in_every_slice(index):
     """Also where nodes lie on the plane, as at index 3; and it holds what the cells' polygons hold."""
@@ -514,11 +470,6 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
     assert (len(segments) > 0) == (len(polygons) > 0) == (1 < index < 5)
     if len(polygons):
         np.testing.assert_allclose([ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))])
-
-
-def test_what_lies_on_the_box_is_no_boundary():
-    image = noise(SHAPE)
-    assert len(SliceView(image, None, None).boundary(lattice_mesh(image, blocks=(2, 2, 2)))) == 0
 
 
 def test_the_detail_is_where_the_outline_bends_most():
@@ -600,18 +551,6 @@ def test_energy_lines_hold_the_history():
     assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]  # connected anew in 2
 
 
-def test_energies_of_a_constant_image_have_no_E_D():
-    top, _ = energy_figure(history(0.0, 0.0)).axes
-    assert [line.get_label().split(",")[0] for line in top.lines] == ["E", "E_G"]
-
-
-def test_energies_of_the_lattice_alone(tmp_path):
-    figure = energy_figure(history(8.0))
-    assert figure.axes[0].get_xlim() == (-0.5, 0.5)
-    save_figure(figure, tmp_path / "a.png", dpi=40)
-    assert (tmp_path / "a.png").stat().st_size > 0
-
-
 # --------------------------------------------------------------------------------------------------
 # A run's three pictures
 
@@ -621,30 +560,6 @@ def run():
     image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
     initial = lattice_mesh(image, blocks=(4, 4))
     return image, initial, optimize_paper(image, initial, iterations=2)
-
-
-def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):
-    image, initial, result = run
-    saved = {}
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.update({path: figure}))
-    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png")]
-    save_run_figures(paths, image, initial, result)
-    assert list(saved) == paths
-    slice_axes = np.array(saved[paths[0]].axes).reshape(2, 2)
-    assert slice_axes[0, 0].get_title() == f"lattice, {len(initial.points)} nodes"
-    fraction = result.history[-1].E_D / result.history[0].E_D
-    assert fraction < 0.95
-    assert slice_axes[0, 1].get_title() == f"optimised, {fraction:.3f} of its E_D"
-    view = SliceView(image, None, None)
-    for column, mesh in enumerate((initial, result.mesh)):
-        for row in (0, 1):
-            drawn = corners(collections(slice_axes[row, column])[0])
-            np.testing.assert_allclose(drawn, view.section(mesh)[0].mean(axis=1))
-    outlines = [p for p in saved[paths[1]].axes[0].patches if p.get_label()]
-    for patch, mesh, word in zip(outlines, (initial, result.mesh), ("lattice", "optimised"), strict=True):
-        assert patch.get_label().startswith(word)
-        np.testing.assert_array_equal(patch.get_data()[0], rho_histogram(mesh.points, mesh.cells)[0])
-    np.testing.assert_array_equal(saved[paths[2]].axes[0].lines[0].get_ydata(), [row.E for row in result.history])
 
 
 def test_pictures_are_written_and_not_blank(tmp_path, run):
@@ -659,18 +574,25 @@ def test_pictures_are_written_and_not_blank(tmp_path, run):
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-def test_a_constant_image_says_so(monkeypatch, tmp_path):
-    image = Image(np.full((8, 9), 7.0))
-    initial = lattice_mesh(image, blocks=(2, 2))
+def test_titles_say_how_many_nodes_and_how_good(monkeypatch, tmp_path, run):
     saved = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
-    save_run_figures(
-        [tmp_path / k for k in "abc"], image, initial, MeshingResult(initial, history(0.0), "iterations", initial)
-    )
-    assert saved[0].axes[1].get_title() == "optimised, constant image"
+    image, initial, result = run
+    flat = Image(np.full(image.shape, 7.0))
+    for shown, made, words in (
+        (image, result, f"{result.history[-1].E_D / result.history[0].E_D:.3f} of its E_D"),
+        (flat, MeshingResult(initial, history(0.0), "iterations", initial), "constant image"),
+    ):
+        save_run_figures([tmp_path / k for k in "abc"], shown, initial, made)
+        before, after, *_ = saved[-3].axes
+        assert before.get_title() == f"lattice, {len(initial.points)} nodes"
+        assert after.get_title() == f"optimised, {words}"
+        drawn = [len(collections(axes)[0].get_paths()) for axes in (before, after)]
+        assert drawn == [len(initial.cells), len(made.mesh.cells)]
+        assert len(saved[-1].axes[0].lines) == (3 if shown is image else 2)
 
 
-@pytest.mark.parametrize("name", ["a", "a.pdf", "a.jpg", "a.png.txt"])
+@pytest.mark.parametrize("name", ["a", "a.png.txt"])
 def test_a_picture_is_a_png_or_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
         save_figure(Figure(), tmp_path / name)

@@ -15,16 +15,11 @@ from tetopt.io.text import plain
 from tetopt.model.labels import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.explore import save_explorer
-from tetopt.report.page import (
-    PAGE_SCRIPTS,
-    policy_html,
-    rendered,
-    script_html,
-    write_page,
-)
+from tetopt.report.page import PAGE_SCRIPTS, picture_html, policy_html, script_html, write_page
 from tetopt.report.viewer import View, views_html
 from tetopt.study.paper_files import _write_page
 
+pytestmark = pytest.mark.deep
 RAN = "document.documentElement.dataset.xss=1"
 
 
@@ -86,21 +81,21 @@ def test_the_page_to_explore(mesh, image, server, tmp_path):
     check_shown(tmp_path / "a.html", server[1], [*names, *(f"{name} 6" for name in names)])
 
 
-def test_the_page_of_sections_and_views(mesh, server, tmp_path):
+def test_the_page_of_pictures_and_views(mesh, server, tmp_path):
     names = hostile(server[0])
     outside = boundary_facets(mesh.cells)
     views = [View(name, mesh.points, outside, np.arange(len(outside), dtype=float)) for name in names[:3]]
     PIL.Image.fromarray(np.zeros((2, 2), dtype=np.uint8)).save(tmp_path / "p.png")
-    pictures = [(tmp_path / "p.png", name) for name in names]
-    sections = [{"title": name, "text": name, "tables": [[names, names]], "pictures": pictures} for name in names]
-    content = rendered("report/sections.html", sections=sections)
-    write_page(tmp_path / "a.html", names[0], content + views_html(views))
+    pictures = [picture_html(tmp_path / "p.png", name) for name in names]
+    write_page(tmp_path / "a.html", names[0], "".join([*pictures, views_html(views)]))
     check_shown(tmp_path / "a.html", server[1], names)
 
 
 def test_the_papers_page(server, tmp_path):
     names = hostile(server[0])
-    sections = [{"title": name, "text": name} for name in names]
+    PIL.Image.fromarray(np.zeros((2, 2), dtype=np.uint8)).save(tmp_path / "p.png")
+    more = {"dice": {names[0]: {names[1]: 0.5}}, "E_D_relative": {names[2]: 0.5}, "pictures": [["p.png", names[3]]]}
+    sections = [{"title": name, "text": name, **more} for name in names]
     results = {"sections": sections, "image": names[0], "versions": {"tetopt": names[1]}}
     _write_page({"paper.html": tmp_path / "a.html"}, results)
     check_shown(tmp_path / "a.html", server[1], names)

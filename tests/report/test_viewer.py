@@ -91,18 +91,6 @@ def test_titles_are_escaped_and_no_views_are_nothing(opened):
     assert views_html([]) == ""
 
 
-def test_constant_values_have_a_grey():
-    low, high = grey_limits([np.ones(3)])
-    assert low < 1.0 < high
-
-
-def test_size(opened):
-    """Two surfaces of 30 000 triangles stay under 3 MB."""
-    random = np.random.default_rng(0)
-    big = View("t", random.normal(size=(15000, 3)), random.integers(0, 15000, (30000, 3)), random.normal(size=30000))
-    assert len(views_html([big, big])) < 3e6
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, opened):
     folder = tmp_path_factory.mktemp("viewer")
@@ -143,6 +131,7 @@ PROBE = """<script>addEventListener("load", () => setTimeout(() => {
 }, 200))</script>"""
 
 
+@pytest.mark.deep
 def test_views_turn_together(page, tmp_path):
     """Drag, keys, wheel and buttons change every view; reset brings the first picture back."""
     shown = document(copied(page.read_text(encoding="utf-8"), tmp_path / "copy.html", last=PROBE))
@@ -153,6 +142,7 @@ def test_views_turn_together(page, tmp_path):
     )
 
 
+@pytest.mark.deep
 def test_a_browser_draws_cells_and_edges(page, tmp_path):
     flags = ["--window-size=800,700", "--virtual-time-budget=2000", f"--screenshot={tmp_path / 'a.png'}"]
     browser(tmp_path / "profile", *flags, page.as_uri())
@@ -163,6 +153,7 @@ def test_a_browser_draws_cells_and_edges(page, tmp_path):
     assert all((part[..., 0] - part[..., 2] > 80).mean() > 0.02 for part in (left, right))  # orange edges
 
 
+@pytest.mark.deep
 def test_without_webgl_it_is_said(page, tmp_path):
     shown = document(copied(page.read_text(encoding="utf-8"), tmp_path / "copy.html", BLIND))
     assert shown.count("This browser has no WebGL 2, so the 3-D view cannot be shown") >= 2

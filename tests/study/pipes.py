@@ -90,10 +90,6 @@ def refuse(job):
     raise tetopt.InputError("thing: expected a, got b; do c")
 
 
-def missing(job):
-    import tetopt_has_no_such_package  # noqa: F401
-
-
 def leave(job):
     os._exit(3)
 

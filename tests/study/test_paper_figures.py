@@ -22,6 +22,11 @@ def errors(name):
 
 
 @functools.cache
+def figure_3ef(data_dir):
+    return paper.figure_3ef(tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"))
+
+
+@functools.cache
 def figure_2(k_D):
     return paper.figure_2(k_D)
 
@@ -137,6 +142,7 @@ def test_figure_2b_moves_from_the_middle_to_the_edge():
     assert away[3] > 10.0
 
 
+@pytest.mark.full
 def test_figure_3ab_brain_slice(data_dir):
     """128 nodes and 224 triangles; "a substantial improvement in the representation".
 
@@ -194,22 +200,22 @@ def test_conditioning_and_strain_energy(snr):
     assert 0.9 < after.strain_energy / before.strain_energy < 1.0
 
 
+@pytest.mark.full
 def test_figure_3e_volume(data_dir):
     """1078 nodes and 3900 tetrahedra, 13 x 10 x 6 cubes of five; the optimised mesh fits the volume better."""
-    volume = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    case = paper.figure_3ef(volume)
+    case = figure_3ef(data_dir)
     assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3e"]
     assert case.result.history[-1].E_D < 0.7 * case.result.history[0].E_D
     v = volumes(case.result.mesh.points, case.result.mesh.cells)
     assert v.sum() == pytest.approx(case.image.volume, rel=1e-12)
 
 
+@pytest.mark.full
 def test_figure_3f_ventricles(data_dir):
     """The largest connected set of tetrahedra under a threshold is the lateral ventricles: on both sides of the middle
     plane, above the anterior commissure (the MNI origin), where the tissue labels have CSF.
     """
-    volume = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    case = paper.figure_3ef(volume)
+    case = figure_3ef(data_dir)
     mesh = case.result.mesh
     bright = np.median(case.image.data[case.image.data > case.image.data.mean()])
     inside = largest_component(mesh.cells, tetopt.cell_moments(case.image, mesh).mean < 0.6 * bright)

@@ -20,8 +20,8 @@ def run(tmp_path_factory, opengl):
     """The whole command, few seeds, on the head phantom in the place of a brain volume."""
     folder = tmp_path_factory.mktemp("paper")
     phantom = tetopt.load_phantom("ellipsoids_brain")
-    tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=3.0))
-    tetopt.save_image(folder / "tissue.nii.gz", phantom.label_image(voxel_mm=3.0))
+    tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=4.0))
+    tetopt.save_image(folder / "tissue.nii.gz", phantom.label_image(voxel_mm=4.0))
     out = folder / "out"
     inputs = ["--image", str(folder / "head.nii.gz"), "--labels", str(folder / "tissue.nii.gz")]
     assert main(["paper", "-o", str(out), *inputs, "--seeds", "3"]) == 0
@@ -87,8 +87,6 @@ def test_counts_and_row_3(run):
     meshes = [row for section in numbers["sections"] for row in section.get("meshes", ())]
     assert [row["name"] for row in meshes] == ["fig2a", "fig3a", "fig3c", "fig3e"]
     assert all(row["paper"] == row["ours"] for row in meshes)
-    (row,) = [r for section in numbers["sections"] for r in section.get("errors", ()) if r["name"] == "fig2a"]
-    assert [round(value, 4) for value in row["ours"]] == row["errors"]
 
 
 def test_segmentation_improves_on_the_lattice(run):
@@ -101,6 +99,7 @@ def test_segmentation_improves_on_the_lattice(run):
     assert mean["4 classes, lattice"] < mean["4 classes, optimised"] <= mean["4 classes, voxels"] + 1e-9
 
 
+@pytest.mark.deep
 def test_page_in_a_browser(run, tmp_path):
     """Headless Chromium draws the page and reports no script or image error."""
     picture = f"--screenshot={tmp_path / 'page.png'}"
@@ -108,6 +107,7 @@ def test_page_in_a_browser(run, tmp_path):
     assert np.std(np.asarray(PIL.Image.open(tmp_path / "page.png").convert("L"))) > 20.0
 
 
+@pytest.mark.full
 def test_paper_refuses(tmp_path, capsys):
     tetopt.save_image(tmp_path / "flat.nii", tetopt.load_phantom("disc_2d").image(voxel_mm=4.0))
     assert main(["paper", "-o", str(tmp_path / "o"), "--image", str(tmp_path / "flat.nii")]) == 2
@@ -150,17 +150,15 @@ def test_fem(tmp_path, block, capsys):
     assert free < energies["one"] < free * 0.7 / (1.3 * 0.4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--young", "1:2;3"], "expected pairs intensity:value"),
-        (["--young", "open('x')"], "cannot use"),
         (["--young", "h - 100"], "such as -50 at intensity 50"),
         (["--young", "0:1,100:1", "--compress", "200"], "--compress: expected a percentage"),
-        (["--young", "0:0"], "average: expected moduli above 0 kPa for gauss"),
         (["--young", "0:0", "--average", "mean"], "young: expected moduli above 0 kPa"),
         (["--average", "power:20"], 'power:P with P from -10 to 10, such as power:0.5, got "power:20"'),
-        (["--nu", "0.5"], "nu"),
         (["--compress", "0"], "--compress"),
     ],
 )
@@ -170,24 +168,6 @@ def test_fem_bad_input(block, options, words, capsys):
     assert words in err[-1]
 
 
-def test_fem_averages(tmp_path, capsys):
-    """Without a mapping, too: of the intensities. Around Gauss points it is another one for quadratic cells."""
-    image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 9.0, (8, 8, 8)))
-    tetopt.save_image(tmp_path / "i.nii", image)
-    tetopt.save_mesh(tmp_path / "i.vtu", tetopt.lattice_mesh(image, blocks=(2, 2, 2)))
-    files, energies = [str(tmp_path / "i.nii"), str(tmp_path / "i.vtu")], {}
-    for average in ("mean", "geometric", "harmonic", "gauss"):
-        for order in "12":
-            options = ["--average", average, "--order", order, "--force", "--json", str(tmp_path / "i.json")]
-            assert main(["fem", *files, *options]) == 0
-            energies[average + order] = json.loads((tmp_path / "i.json").read_text())["strain_energy"]
-    assert energies["harmonic1"] < energies["geometric1"] < energies["mean1"]
-    assert energies["gauss1"] == energies["geometric1"]
-    assert abs(energies["gauss2"] / energies["geometric2"] - 1.0) > 1e-3
-    assert main(["fem", files[1], "--young", "3", "--average", "mean", "--load", "compress:1%"]) == 2
-    assert "--average: it is over an image's voxels; give the IMAGE" in capsys.readouterr().err
-
-
 def written(folder, points, cells):
     """A mesh file with no checks between: what another program may have written."""
     kind = meshio.CellBlock("tetra", np.asarray(cells))
@@ -195,35 +175,34 @@ def written(folder, points, cells):
     return str(folder / "other.vtu")
 
 
+@pytest.mark.full
 def test_fem_bad_meshes(tmp_path, block, capsys):
     """Each refusal names the first offenders."""
     mesh = tetopt.load_mesh(block[1]).mesh
-    assert main(["fem", block[0], written(tmp_path, mesh.points * [1.0, 1.0, 0.5], mesh.cells)]) == 2
-    assert "no node lies on the image's face" in capsys.readouterr().err
-    loose = mesh.points[mesh.cells[0]] * 0.1 + 4.0
-    points = np.vstack([mesh.points, loose])
-    cells = np.vstack([mesh.cells, len(mesh.points) + np.arange(4)])
-    assert main(["fem", block[0], written(tmp_path, points, cells)]) == 2
-    assert f"the first has nodes [{len(mesh.points) + 1}, " in capsys.readouterr().err
-    half = mesh.points[mesh.cells].mean(axis=1)[:, 2] < 3.5
-    cells = np.where(half[:, None], mesh.cells, mesh.cells + len(mesh.points))  # a crack: doubled nodes
-    assert main(["fem", block[0], written(tmp_path, np.vstack([mesh.points] * 2), cells)]) == 2
-    assert "a crack, several pieces" in capsys.readouterr().err
-    assert main(["fem", block[0], written(tmp_path, mesh.points, np.vstack([mesh.cells] * 2))]) == 2
-    assert "overlap" in capsys.readouterr().err
-    assert main(["fem", block[0], written(tmp_path, mesh.points + np.array([1.0, 0.0, 0.0]), mesh.cells)]) == 2
-    assert "lie off the faces" in capsys.readouterr().err
-    flat = mesh.points.copy()
-    flat[mesh.cells[3, 3]] = flat[mesh.cells[3, :3]].mean(axis=0)
-    assert main(["fem", block[0], written(tmp_path, flat, mesh.cells)]) == 2
-    assert "flat or inverted, the first are [3, " in capsys.readouterr().err
-    folded = mesh.points.copy()
-    inner = np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]
-    folded[inner] = folded[mesh.cells[0]].mean(axis=0)
-    assert main(["fem", block[0], written(tmp_path, folded, mesh.cells)]) == 2
-    assert "have cells that overlap there" in capsys.readouterr().err
+    points, cells, n = mesh.points, mesh.cells, len(mesh.points)
+    loose = points[cells[0]] * 0.1 + 4.0
+    half = points[cells].mean(axis=1)[:, 2] < 3.5
+    flat, folded = points.copy(), points.copy()
+    flat[cells[3, 3]] = flat[cells[3, :3]].mean(axis=0)
+    folded[np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]] = folded[cells[0]].mean(axis=0)
+    for changed, joined, words in (
+        (points * [1.0, 1.0, 0.5], cells, "no node lies on the image's face"),
+        (np.vstack([points, loose]), np.vstack([cells, n + np.arange(4)]), f"the first has nodes [{n + 1}, "),
+        (
+            np.vstack([points] * 2),
+            np.where(half[:, None], cells, cells + n),
+            "a crack, several pieces",
+        ),  # doubled nodes
+        (points, np.vstack([cells] * 2), "overlap"),
+        (points + np.array([1.0, 0.0, 0.0]), cells, "lie off the faces"),
+        (flat, cells, "flat or inverted, the first are [3, "),
+        (folded, cells, "have cells that overlap there"),
+    ):
+        assert main(["fem", block[0], written(tmp_path, changed, joined)]) == 2
+        assert words in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
     """A file of left-handed cells is turned when it is read; the numbers are those of the mesh as it should be."""
     mesh = tetopt.load_mesh(block[1]).mesh
@@ -236,6 +215,7 @@ def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
     assert b["strain_energy"] == pytest.approx(a["strain_energy"], rel=1e-12)
 
 
+@pytest.mark.full
 def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     """A mesh of a crop is pressed with the same --crop; the file written holds the displacements that were solved."""
     tetopt.save_image(tmp_path / "a.nii", tetopt.load_phantom("sphere").image(voxel_mm=4.0))
@@ -254,17 +234,6 @@ def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     assert grid.cell_data["strain"][0].shape == (len(grid.cells[0].data), 9)
     assert main(["fem", a, mesh, *box, "-o", mesh, "--force"]) == 2
     assert "is an input of this command too" in capsys.readouterr().err
-
-
-def test_fem_says_when_it_cannot_solve(tmp_path, capsys):
-    tetopt.save_image(tmp_path / "a.nii", tetopt.load_phantom("sphere").image(voxel_mm=4.0))
-    a, mesh = str(tmp_path / "a.nii"), str(tmp_path / "m.vtu")
-    assert main(["mesh", a, "-o", mesh, "--nodes", "300", "--iterations", "1"]) == 0
-    capsys.readouterr()
-    assert main(["fem", a, mesh, "--young", "20:1e-5,100:1e6"]) == 2
-    err = capsys.readouterr().err.strip().splitlines()
-    assert len(err) == 1
-    assert "the moduli differ too much" in err[0]
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])
@@ -290,11 +259,10 @@ def test_simulate_is_the_compression_it_says(turn):
 
 
 def test_turning_the_world_changes_nothing():
-    """A body pressed along its own axis: conditioning and energy are the same however it lies in the scanner."""
-    rng = np.random.default_rng(2)
-    data = rng.uniform(1.0, 5.0, (6, 5, 7))
+    """A body pressed along its own axis: the energy is the same however it lies in the scanner."""
+    data = np.random.default_rng(2).uniform(1.0, 5.0, (6, 5, 7))
     energies = []
-    for turn in (0.0, 0.2, 0.7):
+    for turn in (0.0, 0.7):
         affine = np.eye(4)
         affine[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
         image = tetopt.Image(data, affine)

@@ -5,6 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,133 +15,152 @@ from test_child import is_running, wait_for
 import tetopt
 from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
+from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.topology import boundary_facets
 from tetopt.io.images import sha256
 from tetopt.study.child import run_in_child
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PipelineInput
-from tetopt.study.program import by_program, file_checksums, parse_program, pipelines_with
+from tetopt.study.program import boxed, by_program, file_checksums, parse_program, pipelines_with
 
-PHANTOM = tetopt.load_phantom("sphere")
-IMAGE = PHANTOM.image(voxel_mm=4.0)
+IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 1000, classes=3)
-PYTHON, MESHER = shlex.quote(sys.executable), shlex.quote(str(Path(__file__).with_name("mesher.py")))
+PYTHON = shlex.quote(sys.executable)
+# Each run notes what it is told, keeps what it is to mesh, and gives out the next of the files beside it.
+SCRIPT = 'cd "$(dirname "$0")"; echo "$@" >> log; cp "$1" kept.nii.gz; cp "$(wc -l < log).${2##*.}" "$2"\n'
 
 
-def command(kind, *more):
-    return " ".join(["mine=" + PYTHON, MESHER, kind, "{image} {labels} {nodes} {output}", *more])
+def mesher(folder, *meshes, words="{labels} {output} {nodes} {size} '$HOME;'", **data):
+    """A program that gives out these meshes, one a run, and then fails."""
+    script = folder / "a mesher.sh"
+    script.write_text(SCRIPT)
+    for number, mesh in enumerate(meshes, 1):
+        tetopt.save_mesh(folder / f"{number}.vtu", mesh, data)
+        if mesh.ndim == 3:
+            tetopt.save_model(folder / f"{number}.msh", tetopt.build_model(mesh, IMAGE))
+    return parse_program(f"mine=sh '{script}' {words}")
+
+
+def lattice(nodes):
+    return tetopt.lattice_mesh(IMAGE, nodes=nodes)
+
+
+def scaled(mesh, voxels):
+    """The mesh made wider by so many voxels."""
+    middle = (np.array(IMAGE.shape) - 1) / 2
+    factor = 1 + voxels / np.array(IMAGE.shape)
+    return tetopt.Mesh(IMAGE.to_world(middle + factor * (IMAGE.to_index(mesh.points) - middle)), mesh.cells)
+
+
+def covered(mesh):
+    """The mesh with a node on its lowest side a little further in, and under it cells that fill the dent."""
+    points = mesh.points.copy()
+    low = points[:, 2].min()
+    middle = points[:, :2].mean(axis=0)
+    on_side = np.flatnonzero(points[:, 2] == low)
+    node = on_side[np.argmin(np.linalg.norm(points[on_side, :2] - middle, axis=1))]
+    points[node, 2] += 2e-4
+    facets = boundary_facets(mesh.cells)
+    around = facets[(facets == node).any(axis=1)]
+    rim = np.unique(around[around != node])
+    turns = np.arctan2(*(points[rim, :2] - points[node, :2]).T)
+    rim = rim[np.argsort(turns)]
+    fans = [np.roll(rim, -k) for k in range(len(rim))]  # from a corner of the rim two of its triangles have no area
+    lids = [np.array([[node, fan[0], *pair] for pair in pairwise(fan[1:])]) for fan in fans]
+    best = max(lids, key=lambda cells: np.abs(volumes(points, cells)).min())
+    return tetopt.Mesh(points, np.vstack([mesh.cells, oriented(points, best)]))
 
 
 def test_number_of_nodes_is_corrected(tmp_path):
-    """Asked again with a corrected number, until it is met; with given labels, else with the classes."""
-    log = tmp_path / "log"
-    made = by_program(JOB, parse_program(command("fine", str(log))))
-    assert abs(len(made.mesh.points) / 1000 - 1.0) <= 0.05
-    check_fills_box(IMAGE, made.mesh)
-    lines = log.read_text().splitlines()
-    assert lines[0] == "1000 [0, 1, 2]"
-    assert float(lines[1].split()[0]) > 1100
+    """Asked again with a corrected number, and a size that shrinks by its cube root; no shell reads the words."""
+    few, enough = lattice(670), lattice(1000)
+    made = by_program(JOB, mesher(tmp_path, few, enough))
+    np.testing.assert_array_equal(made.mesh.points, enough.points)
     assert list(made.seconds) == ["program", "search"]
-    assert made.notes == [f"{len(lines)} runs"]
-    log.unlink()
-    labels = tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine)
-    by_program(JOB._replace(labels=labels), parse_program(command("fine", str(log))))
-    assert log.read_text().splitlines()[0] == "1000 [0, 7]"
+    assert made.notes == ["2 runs"]
+    said = [line.split() for line in (tmp_path / "log").read_text().splitlines()]
+    (first, size), (second, smaller) = ((int(words[2]), float(words[3])) for words in said)
+    assert first == 1000
+    assert second == pytest.approx(1000 * 1000 / len(few.points), abs=1)
+    assert smaller / size == pytest.approx((first / second) ** (1 / 3), rel=1e-5)
+    assert {words[4] for words in said} == {"$HOME;"}
+    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, class_labels(IMAGE, 3).data)
 
 
-@pytest.mark.parametrize("kind", ["labelled", "rough-labelled"])
-def test_cells_have_the_labels_of_the_program(kind):
+def test_labels_go_to_the_program_and_come_back(tmp_path):
     """Those of the image, on the cells that are left when flat ones are taken off; not others, nor without labels."""
-    made = by_program(JOB._replace(labels=class_labels(IMAGE, 2)), parse_program(command(kind)))
-    number = np.arange(len(made.mesh.cells))
-    np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, number // 2 % 2, -1))
-    n_known = (number % 2 == 0).sum()
-    assert made.notes[-1] == f'{n_known} of {len(number)} cells count for the "label" that its file gives them'
-    assert by_program(JOB, parse_program(command(kind))).labels is None
-
-
-def test_sizes_instead_of_numbers(tmp_path):
-    """{size} shrinks as the number grows, by its cube root; no shell reads the words."""
-    script = tmp_path / "by size.py"
-    script.write_text(
-        "import sys, tetopt\nimage = tetopt.load_image(sys.argv[1])\n"
-        "assert sys.argv[2] == '$HOME;'\n"
-        "mesh = tetopt.lattice_mesh(image, nodes=round(image.volume / float(sys.argv[3]) ** 3))\n"
-        "tetopt.save_mesh(sys.argv[4], mesh)\n"
+    given, mesh = tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine), covered(scaled(lattice(300), 1))
+    number = np.arange(len(mesh.cells))
+    labels = np.where(number % 2 == 0, 7 * (number // 2 % 2), 99)
+    program = mesher(tmp_path, mesh, mesh, words="{labels} {output}", label=labels)
+    made = by_program(JOB._replace(labels=given), program)
+    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, given.data)
+    n = len(made.mesh.cells)
+    assert n < len(mesh.cells)
+    np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
+    assert (
+        made.notes[-1] == f'{(number[:n] % 2 == 0).sum()} of {n} cells count for the "label" that its file gives them'
     )
-    words = f"mine={PYTHON} '{script}' {{image}} '$HOME;' {{size}} {{output}}"
-    made = by_program(JOB, parse_program(words))
-    assert abs(len(made.mesh.points) / 1000 - 1.0) <= 0.05
+    assert by_program(JOB, program).labels is None
 
 
 def test_other_suffixes(tmp_path):
     """gmsh's own format, and a mesh that no number steers: one run, and a note."""
-    script = tmp_path / "msh.py"
-    script.write_text(
-        "import sys, tetopt\nimage = tetopt.load_image(sys.argv[1])\n"
-        "assert sys.argv[2].endswith('/mesh.msh')\n"
-        "tetopt.save_model(sys.argv[2], tetopt.build_model(tetopt.lattice_mesh(image, nodes=400), image))\n"
-    )
-    made = by_program(JOB, parse_program(f"mine={PYTHON} {script} {{image}} {{output}}.msh"))
+    made = by_program(JOB, mesher(tmp_path, lattice(400), words="{image} {output}.msh"))
     n = len(made.mesh.points)
     assert made.notes == ["1 runs", f"{n} nodes, 1000 were asked for; its runs gave {n}"]
+    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, IMAGE.data)
 
 
-def test_a_count_that_cannot_be_met_is_told():
-    made = by_program(JOB, parse_program(command("stubborn")))
-    n = len(made.mesh.points)
-    assert made.notes == ["5 runs", f"{n} nodes, 1000 were asked for; its runs gave {n}, {n}, {n}, {n}, {n}"]
+def test_a_count_that_cannot_be_met_is_told(tmp_path):
+    """The same mesh twice, and then failures, which are notes."""
+    mesh = lattice(400)
+    made = by_program(JOB, mesher(tmp_path, mesh, mesh))
+    n = len(mesh.points)
+    first, *failures, last = made.notes
+    assert (first, last) == ("2 runs", f"{n} nodes, 1000 were asked for; its runs gave {n}, {n}")
+    assert len(failures) == 3
+    assert all("nodes: mine ended with exit code 1: cp: " in line for line in failures)
 
 
-def test_a_failure_after_a_success_is_a_note():
-    made = by_program(JOB, parse_program(command("once")))
-    assert len(made.mesh.points) < 700
-    assert made.notes[1].endswith("nodes: mine ended with exit code 1: the mesher's own words")
-
-
-def test_a_boundary_near_the_box_is_put_on_it():
-    made = by_program(JOB, parse_program(command("wide")))
-    check_fills_box(IMAGE, made.mesh)
-    assert made.notes[1] == "its boundary was moved by up to 0.5 voxels onto the sides of the image's box"
-
-
-def test_flat_cells_on_the_sides_are_taken_off():
-    """As where points of a side are found roughly: a node a little inside, under a cell that is all but flat."""
-    made, smooth = (by_program(JOB, parse_program(command(kind))) for kind in ("rough", "wide"))
-    check_fills_box(IMAGE, made.mesh)
-    assert len(made.mesh.cells) == len(smooth.mesh.cells)
-    assert made.notes[1] == "its boundary was moved by up to 0.5 voxels onto the sides of the image's box"
+@pytest.mark.parametrize("shape", [lambda mesh: mesh, covered])
+def test_a_boundary_near_the_box_is_put_on_it(shape):
+    """Also one whose nodes lie a little inside, under cells that are all but flat: these are taken off."""
+    mesh, kept, notes = boxed(IMAGE, shape(scaled(lattice(300), 1)))
+    check_fills_box(IMAGE, mesh)
+    assert len(mesh.cells) == len(kept) == len(lattice(300).cells)
+    assert notes == ["its boundary was moved by up to 0.5 voxels onto the sides of the image's box"]
 
 
 def test_a_boundary_far_from_the_box_stays():
-    made = by_program(JOB, parse_program(command("small")))
-    assert made.notes[1] == "its boundary lies up to 3 voxels off the sides of the image's box"
-    index = IMAGE.to_index(made.mesh.points)
-    assert index.min() == pytest.approx(2.5)
+    mesh, _, notes = boxed(IMAGE, scaled(lattice(300), -6))
+    assert notes == ["its boundary lies up to 3 voxels off the sides of the image's box"]
+    assert IMAGE.to_index(mesh.points).min() == pytest.approx(2.5)
 
 
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        ("fails", "mine ended with exit code 1: the mesher's own words"),
-        ("none", "mine wrote no mesh, and wrote nothing on its standard error"),
-        ("flat", "mine: expected tetrahedra, got triangles"),
-    ],
-)
-def test_failures(kind, words):
-    with pytest.raises(tetopt.InputError, match=f"^{words}$"):
-        by_program(JOB, parse_program(command(kind)))
+def test_failures(tmp_path):
+    flat = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+    for program, words in (
+        (mesher(tmp_path, flat), "mine: expected tetrahedra, got triangles"),
+        (mesher(tmp_path), "mine ended with exit code 1: cp: "),
+        (parse_program("mine=true {image} {output}"), "mine wrote no mesh, and wrote nothing on its standard error"),
+    ):
+        with pytest.raises(tetopt.InputError, match=f"^{words}"):
+            by_program(JOB, program)
 
 
+@pytest.mark.deep
 def test_limits_hold_for_what_it_starts(tmp_path):
     """A program that never ends is killed with the child, and its files are gone."""
-    script = tmp_path / "slow.py"
-    script.write_text(f"import sys, time\nopen({str(tmp_path / 'path')!r}, 'w').write(sys.argv[2])\ntime.sleep(600)\n")
-    pipeline = pipelines_with([parse_program(f"mine={PYTHON} {script} {{image}} {{output}}")])["mine"]
+    script = tmp_path / "slow.sh"
+    script.write_text(f'echo "$2" > {tmp_path / "path"}; exec sleep 600\n')
+    pipeline = pipelines_with([parse_program(f"mine=sh {script} {{image}} {{output}}")])["mine"]
     outcome = run_in_child(pipeline.function, JOB, max_seconds=8.0)
     assert outcome.failure == "out of time: killed after 8 s"
-    assert not Path((tmp_path / "path").read_text()).parent.exists()
+    assert not Path((tmp_path / "path").read_text().strip()).parent.exists()
 
 
+@pytest.mark.deep
 def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     """As a scheduler sends it: nothing is left running, no temporary folder stays, and finished runs are kept."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
@@ -191,20 +211,21 @@ def test_bad_commands(text, words, tmp_path, capsys):
     assert not (tmp_path / "out" / "runs").exists()
 
 
-def test_two_of_one_name(tmp_path, capsys):
-    tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
-    twice = ["--pipeline", "a=sh {image} {output}"] * 2
-    assert main(["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), *twice]) == 2
-    assert 'named "a" already' in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_programs_in_the_comparison(tmp_path, opengl):
     """A row as the others have; one that does not fill the box has all but the compression; resumed by its words."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
-    out = tmp_path / "out"
+    script, out = tmp_path / "mesher.py", tmp_path / "out"
+    script.write_text(
+        "import sys, tetopt\nimage = tetopt.load_image(sys.argv[2])\n"
+        "mesh = tetopt.lattice_mesh(image, nodes=round(2 / 3 * int(sys.argv[3])))\n"
+        "tetopt.save_mesh(sys.argv[4], tetopt.Mesh(float(sys.argv[1]) * mesh.points, mesh.cells))\n"
+    )
     options = ["--nodes", "300", "--reference-dofs", "6000", "--curve", "", "--pipelines", "bcc"]
-    fine, small = command("fine"), command("small").replace("mine=", "other=")
+    fine, small, again = (
+        f"{name}={PYTHON} {script} {factor} {{image}} {{nodes}} {{output}}"
+        for name, factor in (("mine", "1"), ("other", "0.7"), ("other", "1.0"))
+    )
     words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(out), *options]
     assert main([*words, "--pipeline", fine, "--pipeline", small]) == 0
     report = json.loads((out / "report.json").read_text())
@@ -213,23 +234,18 @@ def test_programs_in_the_comparison(tmp_path, opengl):
     assert report["options"]["programs"] == [
         {"name": name, "command": text.partition("=")[2]} for name, text in (("mine", fine), ("other", small))
     ]
-    assert report["versions"]["mine, SHA-256 of its files"].split(", ")[-1] == sha256(Path(shlex.split(MESHER)[0]))
+    assert report["versions"]["mine, SHA-256 of its files"].split(", ")[-1] == sha256(script)
     assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [True] * 3
     assert set(mine["median"]["fem"]) == set(bcc["median"]["fem"]) == {"0.3", "0.45"}
     assert mine["median"]["E_D_fraction"] == pytest.approx(bcc["median"]["E_D_fraction"], rel=0.1)
     assert other["median"]["fem"] == {}
     assert "of its boundary facets lie off" in other["median"]["not_compressed"]
     assert 0.0 < other["median"]["labels"][0]["dice"] < 1.0
-    page = (out / "report.html").read_text()
-    assert "other was not compressed" in page
-    before = np.array([mine["median"]["E_D"]])
+    assert "other was not compressed" in (out / "report.html").read_text()
     (out / "runs" / "other-300-1.json").unlink()
-    assert (
-        main([*words, "--pipeline", fine, "--pipeline", command("stubborn").replace("mine=", "other="), "--resume"])
-        == 0
-    )
-    _, mine, other = json.loads((out / "report.json").read_text())["pipelines"]
-    assert np.array_equal([mine["median"]["E_D"]], before)
+    assert main([*words, "--pipeline", fine, "--pipeline", again, "--resume"]) == 0
+    _, kept, other = json.loads((out / "report.json").read_text())["pipelines"]
+    assert kept["median"]["E_D"] == mine["median"]["E_D"]
     assert set(other["median"]["fem"]) == {"0.3", "0.45"}
 
 

@@ -5,9 +5,6 @@ One file without outside references, for someone who has nothing but a browser.
 
 from __future__ import annotations
 
-import html
-import string
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +18,7 @@ from tetopt.image import Image
 from tetopt.io.text import plain
 from tetopt.report.colours import grey_limits
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
-from tetopt.report.page import data_html, packed, policy_html, printed, script_html
+from tetopt.report.page import data_html, packed, policy_html, printed, rendered, script_html
 from tetopt.system.files import save_text
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
@@ -68,10 +65,8 @@ def explorer_html(shown: Exhibit) -> str:
         "factors": warp_factors(shown),
         "axis": first_axis(shown),
     }
-    page = resources.files("tetopt.report").joinpath("explore.html").read_text(encoding="utf-8")
-    words = {"TITLE": html.escape(plain(title)), "POLICY": policy_html()}
-    whole = string.Template(page).substitute(words, DATA=data_html("data", data), SCRIPT=script_html("explorer"))
-    return printed(whole)
+    markup = {"policy": policy_html(), "data": data_html("data", data), "script": script_html("explorer")}
+    return printed(f"{rendered('report/explore.html', title=plain(title), **markup)}\n")
 
 
 def _packed_field(field: Field) -> dict[str, Any]:

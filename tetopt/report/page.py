@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import struct
-from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -47,15 +46,6 @@ def rendered(template: str, **values: Any) -> Markup:
     See https://jinja.palletsprojects.com/ for the language of the templates.
     """
     return Markup(_environment().get_template(template).render(values, picture=picture_html))
-
-
-def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
-    """Write one HTML file without outside references, whole or not at all.
-
-    Each section has a `title`, a `text`, optionally `tables` (rows of cells, the first the heading) and `pictures`
-    (PNG paths with captions).
-    """
-    write_page(path, title, rendered("report/sections.html", sections=sections))
 
 
 def write_page(path: Path, title: str, content: str, style: str = "") -> None:

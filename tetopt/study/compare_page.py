@@ -18,21 +18,26 @@ from tetopt.report.page import package_text, rendered, write_page
 from tetopt.report.viewer import View, views_html
 from tetopt.study.compare_criteria import (
     GROUPS,
+    Criterion,
+    CriterionEntry,
     criteria,
+    entries_of,
     entry,
     fem_error,
     fem_ratios,
+    loss_text,
     number_text,
     of_order,
     short_text,
+    undecided,
     winners,
 )
 from tetopt.study.compare_headline import headline
 from tetopt.study.compare_labels import labels_of
 from tetopt.study.compare_report import ORDER_WORDS, Curve, PipelineResult, Report, averages_of
-from tetopt.study.compare_tables import MeasureRow, measure_rows
 from tetopt.study.pipelines import UNTIMED_STEPS
 
+ARROWS = {-1: " ↓", 1: " ↑", 0: ""}
 GROUP_PICTURES = {  # by the stems of their names, in the sections of their groups
     "Image": ("slices", "quadratic", "cutaways"),
     "Labels": ("labels",),
@@ -60,11 +65,11 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
         "study/compare.html", report=report, first=headline(report), nus=fem_ratios(report), order_words=ORDER_WORDS,
         groups=[_group(report, name) for name in GROUPS], labels=labels_of(report),
         shown=lambda stems: [each for stem in stems for each in pictures if Path(each[0]).stem == stem],
-        best_variants=list(_best_variants(report)), equal_times=equal_times(report), seconds=list(_seconds(report)),
-        not_compressed=list(_not_compressed(report)), views=views_html(views),
+        best_variants=list(_best_variants(report)), equal_times=equal_times(report), views=views_html(views),
+        orders=[(order, of_order(report, order)) for order in ORDER_WORDS], untimed=UNTIMED_STEPS,
         machine=", ".join(f"{key} {_text(value)}" for key, value in report.machine.items()),
         pipelines=[[each.title, each.about] for each in report.pipelines],
-        options=[[name, _text(value)] for name, value in report.options._asdict().items()], notes=_notes(report),
+        options=[[name, _text(value)] for name, value in report.options._asdict().items()],
         number_text=number_text, short_text=short_text, text=_text, winners=winners, numbered=_numbered,
     )  # fmt: skip
     style = package_text("study/compare.css") + package_text("report/viewer.css")
@@ -79,32 +84,68 @@ def _numbered(content: str) -> Markup:
     return Markup(content)
 
 
-class MeasureGroup(NamedTuple):
-    """A section of measures."""
+class MeasureCell(NamedTuple):
+    """What a pipeline has for a measure."""
 
-    name: str
-    rows: list[MeasureRow]
-    details: list[MeasureRow]
-    blind: list[tuple[str, str]]  # measures, and what they do not see
-    pictures: tuple[str, ...]  # stems of their names
+    pipeline: PipelineResult
+    entry: CriterionEntry
+    kinds: str  # classes of the markup
+    mark: str  # "" without
 
 
-def _group(report: Report, name: str) -> MeasureGroup:
+class MeasureRow(NamedTuple):
+    """A measure of all pipelines."""
+
+    part: str  # the heading before it, "" where it is the one of the row above
+    title: str
+    cells: list[MeasureCell]
+
+
+def _group(report: Report, name: str) -> dict[str, Any]:
+    """A section of measures: its rows, those that are folded away, and what each does not see."""
     rows = [row for row in criteria(report) if row.group == name]
+    blind = dict.fromkeys((row.title, row.blind) for row in rows if row.blind)
     shown, details = (
         measure_rows(report, [row for row in rows if row.is_detail == is_one]) for is_one in (False, True)
     )
-    blind = list(dict.fromkeys((row.title, row.blind) for row in rows if row.blind))
-    return MeasureGroup(name, shown, details, blind, GROUP_PICTURES[name])
+    return {"name": name, "rows": shown, "details": details, "blind": list(blind), "pictures": GROUP_PICTURES[name]}
 
 
-def _not_compressed(report: Report) -> Iterator[tuple[str, str]]:
-    """The meshes that were not compressed, and why."""
-    for order, word in ORDER_WORDS.items():
-        for each in of_order(report, order):
-            reason = None if each.median is None else each.median.measurement.not_compressed
-            if reason is not None:
-                yield f"{each.title}{'' if order == 1 else f', {word} cells,'}", reason
+def measure_rows(report: Report, rows: Sequence[Criterion]) -> list[MeasureRow]:
+    """The rows of a table of these measures; none for those that no pipeline has."""
+    lines, part = [], None
+    for row in rows:
+        entries = entries_of(row, report)
+        if any(each.value is not None for each in entries):
+            head = "" if row.part in (part, row.group) else row.part
+            lines.append(MeasureRow(head, row.title + ARROWS[row.better], list(_cells(row, report, entries))))
+            part = row.part
+    return lines
+
+
+def _cells(row: Criterion, report: Report, entries: Sequence[CriterionEntry]) -> Iterator[MeasureCell]:
+    best = winners(row.better, [each.value for each in entries])
+    open_words = _open_win(row, report, entries, best)
+    for number, (pipeline, each) in enumerate(zip(of_order(report, row.order), entries, strict=True)):
+        kinds, mark = pipeline.kind, ""
+        if number in best and open_words:
+            mark = open_words
+        elif number in best:
+            kinds, mark = f"{kinds} best", "best" if len(best) == 1 else "best, tied"
+        elif best and pipeline.kind == "tetopt" and (top := entries[best[0]].value) is not None:
+            why = undecided(row, report, number, best[0])
+            kinds += "" if why else " lost"
+            mark = loss_text(each.value, top) + (why and f", {why}")
+        yield MeasureCell(pipeline, each, kinds, mark)
+
+
+def _open_win(row: Criterion, report: Report, entries: Sequence[CriterionEntry], best: Sequence[int]) -> str:
+    """Why the best value of a row is no verdict over the one after it; "" where it is one, or shared."""
+    others = [place for place, each in enumerate(entries) if each.value is not None and place not in best]
+    if len(best) != 1 or not others:
+        return ""
+    after = max(others, key=lambda place: row.better * (entries[place].value or 0.0))
+    return undecided(row, report, best[0], after)
 
 
 class Variant(NamedTuple):
@@ -170,28 +211,6 @@ def _error_at(curve: Curve, nu: str, average: str, seconds: float) -> float | No
         return None
     x, y = np.log(np.array(points, dtype=np.float64)).T
     return float(np.exp(np.interp(np.log(seconds), x, y)))
-
-
-def _seconds(report: Report) -> Iterator[list[str]]:
-    """Rows of pipeline, step, median of its seconds, their range, and a remark."""
-    for pipeline in report.pipelines:
-        median, low, high = pipeline.median, pipeline.low, pipeline.high
-        if median is None or low is None or high is None:
-            yield [pipeline.title, "–", "–", "", "not installed" if pipeline.reason == "missing" else "failed"]
-            continue
-        for step, seconds in median.seconds.items():
-            spread = f"{number_text(low.seconds[step])} to {number_text(high.seconds[step])}"
-            spread = spread if len(pipeline.runs) > 1 else ""
-            yield [pipeline.title, step, number_text(seconds), spread, UNTIMED_STEPS.get(step, "")]
-
-
-def _notes(report: Report) -> list[str]:
-    return [
-        f"{pipeline.title}{'' if order == 1 else ', quadratic cells'}: {note}"
-        for order in ORDER_WORDS
-        for pipeline in of_order(report, order)
-        for note in pipeline.notes
-    ]
 
 
 def _text(value: Any, between: str = ", ") -> str:

@@ -24,7 +24,7 @@ from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
 from tetopt.report.figures import save_figure, slice_figure
-from tetopt.report.page import save_page
+from tetopt.report.page import rendered, write_page
 from tetopt.report.scene import (
     dark_structure_surface,
     isosurface_before_slices,
@@ -44,7 +44,6 @@ CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.j
     "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",
 }  # fmt: skip
-ERROR_NAMES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
 
 
 def reproduce(
@@ -240,59 +239,11 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
-    folder = paths["paper.html"].parent
-    pages = []
-    for section in results["sections"]:
-        pictures = [(folder / name, caption) for name, caption in section.get("pictures", ())]
-        tables = [_lines(section), _minima_lines(section), _dice_lines(section)]
-        pages.append({"title": section["title"], "text": section["text"], "pictures": pictures, "tables": tables})
-    words = paper.printed()["page"]
+    words, sections = paper.printed()["page"], results["sections"]
     intro = words["intro"].format(version=results["versions"]["tetopt"], image=results["image"])
-    if not any(section.get("dice") and "Section 5" in section["title"] for section in results["sections"]):
+    if not any("dice" in section and "Section 5" in section["title"] for section in sections):
         intro += words["no_labels"]
-    pages.insert(0, {"title": "What this is", "text": intro})
-    save_page(paths["paper.html"], "The paper's figures and table, reproduced", pages)
-
-
-def _lines(section: dict[str, Any]) -> list[list[str]]:
-    """Every number of a section beside the printed one, as rows of text; the last column is the seeds' spread."""
-    rows = []
-    for row in section.get("errors", ()):
-        name = row["title"] + (f", {row['case']}" if "case" in row else "")
-        for k, (title, printed, ours) in enumerate(zip(ERROR_NAMES, row["errors"], row["ours"], strict=True)):
-            spread = [f"{row['p5'][k]:.4f} to {row['p95'][k]:.4f}"] if "p5" in row else []
-            difference = f"{ours - printed:+.4f}".replace("-0.0000", "+0.0000")
-            rows.append([f"{name}: {title}", f"{printed:.4f}", f"{ours:.4f}", difference, *spread])
-            if k == 1:
-                mean = row["geometric_mean"]
-                rows.append(
-                    [f"{name}: the same, geometric", f"{printed:.4f}", f"{mean:.4f}", f"{mean - printed:+.4f}"]
-                    + ([f"{row['p5'][4]:.4f} to {row['p95'][4]:.4f}"] if "p5" in row else [])
-                )
-    for row in section.get("meshes", ()):
-        for what, printed, ours in zip(("nodes", "cells"), row["paper"], row["ours"], strict=True):
-            rows.append([what, str(printed), str(ours), str(ours - printed)])
-    for case in section.get("simulation", ()):
-        for name, change in case["change"].items():
-            row = [f"{case['case']}: change of the {CHANGE_WORDS[name]}", "", f"{100 * change:+.1f} %", ""]
-            if (printed := section["printed_change"].get(name)) is not None:
-                row[1], row[3] = f"{100 * printed:+.0f} %", f"{100 * (change - printed):+.1f} points"
-            rows.append(row)
-    for title, value in section.get("E_D_relative", {}).items():
-        rows.append([f"{title}: E_D relative to the initial mesh", "", f"{value:.4f}", ""])
-    width = max(map(len, rows), default=0)
-    head = ["", "printed", "ours", "difference", "5 % to 95 % of seeds"][:width]
-    return [head, *([*row, *[""] * (width - len(row))] for row in rows)] if rows else []
-
-
-def _minima_lines(section: dict[str, Any]) -> list[list[str]]:
-    rows = [[f"{row['k_D']:g}", f"{row['lowest']:.4f}", f"{row['found']:.4f}"] for row in section.get("minima", ())]
-    return [["k_D", "lowest E on a grid of 41 x 41 places", "E where the descent ends"], *rows] if rows else []
-
-
-def _dice_lines(section: dict[str, Any]) -> list[list[str]]:
-    """A row for each way of labelling the voxels, a column for each label."""
-    overlaps = section.get("dice", {})
-    labels = list(dict.fromkeys(label for row in overlaps.values() for label in row))
-    rows = [[title, *(f"{row[label]:.3f}" for label in labels)] for title, row in overlaps.items()]
-    return [["Dice", *(f"label {label}" for label in labels)], *rows] if rows else []
+    content = rendered(
+        "study/paper.html", intro=intro, sections=sections, change_words=CHANGE_WORDS, folder=paths["paper.html"].parent
+    )
+    write_page(paths["paper.html"], "The paper's figures and table, reproduced", content)
