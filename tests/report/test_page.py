@@ -1,7 +1,5 @@
 """The page builder: one file, text escaped, nothing half written."""
 
-import re
-
 import jinja2
 import numpy as np
 import PIL.Image
