@@ -1,6 +1,5 @@
 """The page builder: one file, text escaped, nothing half written."""
 
-
 import jinja2
 import numpy as np
 import PIL.Image

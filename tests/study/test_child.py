@@ -48,6 +48,7 @@ def test_job_arrives_whole():
     assert outcome.notes == ["a note"]
 
 
+@pytest.mark.full
 def test_a_refusal_is_one_line():
     assert run_in_child(pipes.refuse, JOB, max_seconds=60.0).failure == "thing: expected a, got b; do c"
 

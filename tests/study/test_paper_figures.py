@@ -42,6 +42,7 @@ def simulated(snr):
     return paper.simulate(case.image, case.initial)[0], paper.simulate(case.image, case.result.mesh)[0]
 
 
+@pytest.mark.full
 def test_row_1_and_2_random_nodes():
     """Fig. 1, 20 seeds. The paper shows one draw, made in a way it does not tell.
 

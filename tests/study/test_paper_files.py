@@ -28,12 +28,14 @@ def run(tmp_path_factory, opengl):
     return out
 
 
+@pytest.mark.full
 def test_files(run):
     assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PAPER_PICTURES}
     for name in PAPER_PICTURES:
         assert np.std(np.asarray(PIL.Image.open(run / name).convert("L"))) > 10.0, name
 
 
+@pytest.mark.full
 def test_page_holds_every_number(run):
     """Each printed number and each of ours stands in the page as the JSON has it; nothing points outside."""
     numbers = json.loads((run / "paper.json").read_text())
@@ -52,6 +54,7 @@ def test_page_holds_every_number(run):
     assert not re.search(r"(src|href)=[\"'](?!data:)", page)
 
 
+@pytest.mark.full
 def test_every_other_number_is_on_the_page(run):
     """E_D, minima, Dice and changes of the JSON are in the page; changes are after over before; rows are their own."""
     sections = {s["title"]: s for s in json.loads((run / "paper.json").read_text())["sections"]}
@@ -82,6 +85,7 @@ def test_every_other_number_is_on_the_page(run):
         np.testing.assert_allclose([row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0))
 
 
+@pytest.mark.full
 def test_counts_and_row_3(run):
     numbers = json.loads((run / "paper.json").read_text())
     meshes = [row for section in numbers["sections"] for row in section.get("meshes", ())]
@@ -89,6 +93,7 @@ def test_counts_and_row_3(run):
     assert all(row["paper"] == row["ours"] for row in meshes)
 
 
+@pytest.mark.full
 def test_segmentation_improves_on_the_lattice(run):
     """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh beats the lattice's."""
     sections = json.loads((run / "paper.json").read_text())["sections"]

@@ -124,6 +124,7 @@ def test_shaken_boundary_is_put_back():
     assert np.array_equal(points.max(axis=0), high)
 
 
+@pytest.mark.full
 def test_hole_is_refused():
     mesh = tetopt.lattice_mesh(IMAGE, nodes=60)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)

@@ -12,7 +12,6 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tetopt.geometry.box import box_sides
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -25,7 +24,6 @@ from tetopt.system.files import check_suffix, written_whole
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
 GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell them, and the voxels show through
-MAX_PIXELS = 1024  # of the image's slice along either side: about the picture's
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
@@ -134,7 +132,7 @@ def opened_mesh(shown: Exhibit) -> Draw:
             plotter.add_mesh(section, lighting=False, opacity=1.0 if image is None else GLASS_OPACITY, **look)
         if image is not None:
             plotter.add_mesh(
-                plane_slice(image, axis, middle[axis]), scalars="h", cmap="gray", nan_opacity=0.0, lighting=False,
+                plane_slice(image, axis, middle[axis]), scalars="h", cmap="gray", lighting=False,
                 clim=grey_limits([image.data.astype(np.float64)]), show_scalar_bar=False,
             )  # fmt: skip
         _add_key(plotter, field)
@@ -170,8 +168,8 @@ def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
     plotter.add_legend(entries, bcolor="white", face="rectangle", size=(0.2, 0.03 * len(entries)))
 
 
-def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:
-    """The image in a world plane, in pixels of half the voxels' shortest edge: each has the voxel around its centre.
+def plane_slice(image: Image, axis: int, at: float) -> pyvista.PolyData:
+    """The image in a world plane: a polygon for each voxel that the plane cuts.
 
     Parameters
     ----------
@@ -184,28 +182,14 @@ def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:
 
     Returns
     -------
-    pyvista.ImageData
-        One layer of cells with data `h`, float64, NaN outside of the image; up to `MAX_PIXELS` along a side.
+    pyvista.PolyData
+        World mm, with cell data `h`, the voxels' values.
     """
-    corners = np.stack(np.meshgrid(*box_sides(image.shape), indexing="ij"), axis=-1)
-    world = image.to_world(corners.reshape(-1, 3))
-    low, high = world.min(axis=0), world.max(axis=0)
-    pixel = max(float(image.spacing.min()) / 2.0, float(np.delete(high - low, axis).max()) / MAX_PIXELS)
-    counts = np.maximum(np.ceil((high - low) / pixel - 1e-9).astype(np.int64), 1)
-    counts[axis] = 1
-    low[axis] = at
-    centres = [low[k] + pixel * (np.arange(counts[k]) + 0.5) for k in range(3)]
-    centres[axis] = np.array([at])
-    index = image.to_index(np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1))
-    voxel = np.floor(index + 0.5).astype(np.int64)
-    is_inside = ((voxel >= 0) & (voxel < image.shape)).all(axis=-1)
-    h = np.full(voxel.shape[:3], np.nan)
-    h[is_inside] = image.data[tuple(voxel[is_inside].T)]
-    dimensions = counts + 1
-    dimensions[axis] = 1
-    sheet = pyvista.ImageData(dimensions=dimensions, spacing=(pixel,) * 3, origin=low)
-    sheet.cell_data["h"] = h.ravel(order="F")
-    return sheet
+    voxels = pyvista.ImageData(dimensions=np.array(image.shape) + 1, origin=(-0.5, -0.5, -0.5))
+    voxels.cell_data["h"] = image.data.ravel(order="F")
+    # The index of a place in the plane; between two layers of voxels the upper is shown.
+    inside = np.linalg.inv(image.affine[:3, :3])[:, axis] * (at - image.affine[axis, 3]) + 1e-6
+    return voxels.slice(normal=image.affine[axis, :3], origin=inside).transform(image.affine, inplace=False)
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -101,6 +100,14 @@ def run_in_child(
 def _run_once(
     pipeline: Callable[[PipelineInput], Produced], job: PipelineInput, max_seconds: float, max_bytes: int | None
 ) -> Outcome:
+    deadline = time.monotonic() + max_seconds
+
+    def passed(peak: int) -> str | None:
+        """The limit that the run has passed, in words."""
+        if max_bytes is not None and peak > max_bytes:
+            return f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
+        return f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
+
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
         (folder / "job.pickle").write_bytes(pickle.dumps((pipeline, job)))
@@ -108,16 +115,8 @@ def _run_once(
         with open(folder / "stderr.txt", "wb") as errors:
             environment = python_environment(TMPDIR=name)
             with started(command, environment, folder, stdout=subprocess.DEVNULL, stderr=errors) as child:
-                passed = partial(_passed, time.monotonic() + max_seconds, max_seconds, max_bytes)
                 peak, limit = watched(child, POLL_SECONDS, family_bytes, passed)
         return _outcome(folder, child.returncode, peak, limit)
-
-
-def _passed(deadline: float, max_seconds: float, max_bytes: int | None, peak: int) -> str | None:
-    """The limit that a run has passed, in words."""
-    if max_bytes is not None and peak > max_bytes:
-        return f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
-    return f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
 
 
 def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:

@@ -42,30 +42,9 @@ from tetopt.model.averages import element_young, young_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.mappings import ModulusMapping
 from tetopt.report.summary import image_summary, versions
+from tetopt.study import compare_report as records
 from tetopt.study.child import run_in_child
-from tetopt.study.compare_report import (
-    Attempt,
-    Curve,
-    CurvePoint,
-    Histogram,
-    ImageFacts,
-    ImageSource,
-    LabelRow,
-    LabelSource,
-    Measurement,
-    PipelineResult,
-    PipelineRun,
-    ReferenceEnergy,
-    ReferenceGrid,
-    Report,
-    Settings,
-    Simulation,
-    Solved,
-    TradeoffRow,
-    as_json,
-    averages_of,
-    from_json,
-)
+from tetopt.study.compare_report import Attempt, Measurement, Report, Settings, as_json, averages_of, from_json
 from tetopt.study.pipelines import UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
@@ -91,8 +70,8 @@ class Comparison(NamedTuple):
     labels: Image | None  # for tetopt's own pipelines besides the image, and for those that segment
     mapping: ModulusMapping  # from intensity to kPa
     settings: Settings
-    image_source: ImageSource
-    label_source: LabelSource | None
+    image_source: records.ImageSource
+    label_source: records.LabelSource | None
     mapping_words: str
     command: str
 
@@ -233,8 +212,8 @@ def measured(
         n_missed_voxels=int((owner < 0).sum()),
         n_empty_cells=int((moments.n_voxels == 0).sum()),
         quality=quality(mesh.points, mesh.cells),
-        rho_histogram=Histogram(edges.tolist(), fraction.tolist()),
-        dihedral_histogram=Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
+        rho_histogram=records.Histogram(edges.tolist(), fraction.tolist()),
+        dihedral_histogram=records.Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=_label_rows(standard, mesh, of_cell, moments.mean, owner),
         fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
         not_compressed=not_compressed,
@@ -247,7 +226,7 @@ def _label_rows(
     of_cell: NDArray[np.int64] | None,
     means: NDArray[np.float64],
     owner: NDArray[np.int64],
-) -> list[LabelRow]:
+) -> list[records.LabelRow]:
     """A row for each label of the image: `LabelFidelity`, `LabelInterface`, the voxels of its cells, E_D's fraction."""
     of_voxels = cell_labels(standard.labels, mesh)
     of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
@@ -258,7 +237,7 @@ def _label_rows(
     squares = np.bincount(label, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
     total = float(((h - h.mean()) ** 2).sum())
     return [
-        LabelRow(
+        records.LabelRow(
             label=row.label, voxels=row.voxels, mesh_voxels=int(painted[row.label]), dice=row.dice,
             E_D_fraction=float(squares[row.label]) / total if total > 0.0 else None, is_lost=row.is_lost,
             volume_mm3=row.volume, mesh_volume_mm3=row.mesh_volume,
@@ -274,11 +253,11 @@ def _label_rows(
     ]  # fmt: skip
 
 
-def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> Simulation:
+def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> records.Simulation:
     """The compression test on a mesh, and how far it is from the reference, with each average of the moduli."""
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
-    averages: dict[str, Solved] = {}
+    averages: dict[str, records.Solved] = {}
     for average in standard.averages:
         young = element_young(standard.modulus_fine, mesh, None, average, order)
         begin = time.thread_time()
@@ -288,9 +267,9 @@ def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, 
         )
         seconds = time.thread_time() - begin
         errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
-        averages[average] = Solved(pressed.strain_energy, errors, seconds)
+        averages[average] = records.Solved(pressed.strain_energy, errors, seconds)
     system = conditioning(pressed.system)  # of the last, the average that is set
-    return Simulation(system.lambda_max, system.cond, system.cg_iterations, averages)
+    return records.Simulation(system.lambda_max, system.cond, system.cg_iterations, averages)
 
 
 # All pipelines.
@@ -338,7 +317,7 @@ def _run(
     standard = prepared(image, classes, comparison.mapping, settings)
     pipelines = pipelines_with(settings.programs)
     bench = Bench(comparison, standard, pipelines, runs, resume, facts)
-    results: dict[int, list[PipelineResult]] = {1: [], 2: []}
+    results: dict[int, list[records.PipelineResult]] = {1: [], 2: []}
     meshes: dict[int, dict[str, Mesh]] = {1: {}, 2: {}}
     curves = []
     for name, order in product(settings.pipelines, results):
@@ -349,12 +328,12 @@ def _run(
             path = _run_path(bench, name, order, settings.nodes, first)
             meshes[order][name] = load_mesh(path.with_suffix(".vtu")).mesh
         curves.append(_curve(bench, results[order][-1], order))
-    sweep: list[TradeoffRow] = []
+    sweep: list[records.TradeoffRow] = []
     for order in results if settings.tradeoff else ():
         sweep += tradeoff(image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of))
     report = Report(
         command=comparison.command,
-        image=ImageFacts(
+        image=records.ImageFacts(
             comparison.image_source, image.shape, image.spacing.tolist(), float(np.var(image.data, dtype=np.float64))
         ),
         labels=comparison.label_source,
@@ -450,8 +429,8 @@ def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
     """A pipeline as often as its result varies; the first failure is the last attempt."""
     settings = bench.comparison.settings
     attempts: list[Attempt] = []
-    for repeat in range(settings.repeats if bench.pipelines[name].is_random else 1):
-        attempts.append(_attempt(bench, name, order, settings.nodes, repeat + 1))
+    while len(attempts) < (settings.repeats if bench.pipelines[name].is_random else 1):
+        attempts.append(_attempt(bench, name, order, settings.nodes, len(attempts) + 1))
         if attempts[-1].failure is not None:
             break
     return attempts
@@ -501,7 +480,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     fields |= {} if outcome.labels is None else {"label": outcome.labels}
     save_mesh(mesh_path, outcome.mesh, fields)
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
-    done = PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
+    done = records.PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
     _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     fraction = "none" if measurement.E_D_fraction is None else f"{measurement.E_D_fraction:.4f}"
     note(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
@@ -509,7 +488,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     return from_json(Attempt, _read_back(path))
 
 
-def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> PipelineResult:
+def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> records.PipelineResult:
     """A pipeline's entry in the report."""
     runs = [attempt.run for attempt in attempts if attempt.run is not None]
     failures = [attempt.failure for attempt in attempts if attempt.failure is not None]
@@ -517,7 +496,7 @@ def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> PipelineR
     crashes = [crash for attempt in attempts for crash in attempt.crashes]
     reason = next((attempt.reason for attempt in attempts if attempt.failure is not None), None)
     failure = failures[0] if failures else None
-    result = PipelineResult(name, shown.title, shown.kind, shown.about, failure, reason, crashes, notes, runs)
+    result = records.PipelineResult(name, shown.title, shown.kind, shown.about, failure, reason, crashes, notes, runs)
     if not runs:
         return result
     median, low, high = (elementwise(runs, of) for of in (np.median, np.min, np.max))
@@ -540,7 +519,7 @@ def elementwise(rows: list[Any], of: Callable[[Any], Any]) -> Any:
     return int(value) if all(isinstance(row, int) for row in rows) and value.is_integer() else value
 
 
-def _curve(bench: Bench, result: PipelineResult, order: int) -> Curve:
+def _curve(bench: Bench, result: records.PipelineResult, order: int) -> records.Curve:
     """Errors against the number of nodes; one run a count besides the main one. Failures are noted in `result`."""
     runs = [] if result.median is None else [result.median]
     settings = bench.comparison.settings
@@ -552,18 +531,18 @@ def _curve(bench: Bench, result: PipelineResult, order: int) -> Curve:
         else:
             result.notes.append(f"at {nodes} nodes: {attempt.failure}")
     points = [
-        CurvePoint(each.n_nodes, each.E_D_fraction, each.fem)
+        records.CurvePoint(each.n_nodes, each.E_D_fraction, each.fem)
         for each in sorted((run.measurement for run in runs), key=lambda each: each.n_nodes)
     ]
-    return Curve(result.name, result.title, order, points)
+    return records.Curve(result.name, result.title, order, points)
 
 
-def _reference_grid(standard: Standard) -> ReferenceGrid:
+def _reference_grid(standard: Standard) -> records.ReferenceGrid:
     first = next(iter(standard.references.values()))
     is_same = standard.modulus.shape == standard.image.shape
     note = "a hexahedron to every voxel" if is_same else "the modulus averaged over a coarser grid, for meshes too"
     by_nu = {
-        nu: ReferenceEnergy(each.strain_energy, each.own_error, each.work.iterations)
+        nu: records.ReferenceEnergy(each.strain_energy, each.own_error, each.work.iterations)
         for nu, each in standard.references.items()
     }
-    return ReferenceGrid(standard.modulus.shape, first.n_dofs, note, by_nu)
+    return records.ReferenceGrid(standard.modulus.shape, first.n_dofs, note, by_nu)

@@ -113,6 +113,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
         its standard error.
     """
     words = shlex.split(program.command)
+    suffix = next(suffix for word in words if (suffix := _suffix(word)) is not None)
     is_steered = any(f"{{{key}}}" in program.command for key in ("nodes", "size"))
     notes: list[str] = []
     sizes: list[int] = []
@@ -123,7 +124,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
             request = max(round(factor * job.nodes), LEAST_REQUEST)
             values = paths | {"nodes": str(request), "size": f"{node_spacing(job.image, request):.6g}"}
             try:
-                loaded = _run(program.name, [_filled(word, values) for word in words], _output(words, values["output"]))
+                loaded = _run(program.name, [_filled(word, values) for word in words], Path(values["output"] + suffix))
             except InputError as error:
                 if not sizes:
                     raise
@@ -159,10 +160,6 @@ def _filled(word: str, values: dict[str, str]) -> str:
     """An argument with its placeholders filled; the mesh is a VTU file unless a suffix follows its placeholder."""
     word = re.sub(r"\{output\}(?!\.\w)", "{output}.vtu", word)
     return re.sub(r"\{(\w+)\}", lambda match: values[match[1]], word)
-
-
-def _output(words: list[str], stem: str) -> Path:
-    return Path(stem + next(suffix for word in words if (suffix := _suffix(word)) is not None))
 
 
 def _own_labels(
