@@ -7,13 +7,14 @@ to need. Jobs that end, by their wall time or otherwise, are replaced as long as
 from __future__ import annotations
 
 import re
-import reprlib
 import shlex
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,8 @@ from tetopt.system.budget import memory_words
 from tetopt.system.incoming import text_of
 from tetopt.system.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
+YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
+YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000
 JOBS_AT_ONCE = 20  # where `workers` does not say: a cluster's other users wait for as many cores
 JOB_CORES = 4  # of a job where neither its file nor `threads` says
 QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
@@ -42,16 +45,8 @@ AGAIN_SECONDS = 60.0  # after a job that was refused when others were not, until
 MOST_LOST = 3  # jobs that ended before their worker was there, one after the other: they are not going to be better
 # Keys that dask-jobqueue still takes under their old names, with a warning.
 OLD_KEYS = {"extra", "job-extra", "env-extra"}
-# By which a file says its memory for dask, and what SLURM and LSF are asked for instead.
-MEMORY_NAMES = ("memory", "job-mem", "mem")
 # What must say the memory by the site's own words, as dask-jobqueue does not there.
 MEMORY_KEYS = {"sge": "resource-spec", "oar": "memory-per-core-property-name"}
-# Of values, by the types of dask-jobqueue's own.
-VALUE_WORDS: dict[type, str] = {
-    list: "a list of texts",
-    dict: "keys with their values",
-    str: 'a text in quotes, as "12:00:00" (without, YAML reads a number)',
-}
 # In directives of a job neither blanks nor quotes can be relied on.
 PLAIN_PATH = re.compile(r"[\w./+@=:,-]+")
 
@@ -137,15 +132,9 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
     Raises
     ------
     InputError
-        Not YAML, another system or key than there are, a value of another type than dask-jobqueue's own.
+        Not YAML, aliases in it, another system or key than there are, a value of another type.
     """
-    import dask
-    import yaml
-
-    try:
-        table = yaml.safe_load(text_of(path, "file of dask-jobqueue's configuration"))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(f"{path}: expected YAML, got {_short(error)}; mend that place") from error
+    table = _yaml_of(path)
     systems = table.get("jobqueue") if isinstance(table, dict) and set(table) == {"jobqueue"} else None
     if not isinstance(systems, dict) or len(systems) != 1:
         raise InputError(
@@ -154,34 +143,19 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
     kind, raw = next(iter(systems.items()))
     kinds = _kinds()
     if kind not in kinds:
-        raise InputError(f"{path}: jobqueue: expected one of {', '.join(sorted(kinds))}, got {_shown(kind)}")
+        raise InputError(f"{path}: jobqueue: expected one of {', '.join(sorted(kinds))}, got {_short(kind)}")
     if not isinstance(raw, dict | None):
-        raise InputError(f"{path}: {kind}: expected keys with their values, got {_shown(raw)}")
-    defaults = {key: value for key, value in dask.config.get(f"jobqueue.{kind}").items() if key not in OLD_KEYS}
-    settings = {str(name).replace("_", "-"): value for name, value in (raw or {}).items()}
-    for key, value in settings.items():
-        if key not in defaults:
-            raise InputError(f"{path}: {kind}: expected keys of {', '.join(sorted(defaults))}, got {_shown(key)}")
-        own = type(defaults[key])
-        if not isinstance(value, own if own in VALUE_WORDS else str | int | float | None):
-            words = VALUE_WORDS.get(own, "one value")
-            raise InputError(f"{path}: {kind}: {key}: expected {words}, got {_shown(value)}")
-    _numbers(path, kind, settings)
+        raise InputError(f"{path}: {kind}: expected keys with their values, got {_short(raw)}")
+    defaults = _defaults()[kind]
+    keys = sorted(set(defaults) - OLD_KEYS)
+    settings: dict[str, Any] = {}
+    for name, value in (raw or {}).items():
+        key = name.replace("_", "-") if isinstance(name, str) else name
+        if key not in keys:
+            raise InputError(f"{path}: {kind}: expected keys of {', '.join(keys)}, got {_short(name)}")
+        _check_value(f"{path}: {kind}: {key}", key, value, defaults[key])
+        settings[key] = value
     return kind, settings
-
-
-def _numbers(path: Path, kind: str, settings: dict[str, Any]) -> dict[str, float]:
-    """The numbers that a file states: of cores and processes, and bytes of memory; InputError for what are none."""
-    from dask.utils import parse_bytes
-
-    readers: dict[str, Callable[[Any], float]] = {"cores": int, "processes": int}
-    readers |= dict.fromkeys(MEMORY_NAMES, parse_bytes)
-    stated = {key: read for key, read in readers.items() if settings.get(key) is not None}
-    with _refused(f"{path}: {kind}: expected whole numbers of cores and processes, and memory as '8 GB', got"):
-        numbers = {key: read(settings[key]) for key, read in stated.items()}
-        if wrong := [key for key, number in numbers.items() if number < 1]:
-            raise ValueError(f"{wrong[0]} {settings[wrong[0]]}")
-    return numbers
 
 
 def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Request:
@@ -192,23 +166,25 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
     InputError
         Fewer cores or less memory than a task needs, or no memory where dask-jobqueue cannot tell the system.
     """
-    numbers = _numbers(path, kind, settings)
-    processes = int(numbers.pop("processes", 1))
-    cores = int(numbers.pop("cores", (need.threads or JOB_CORES) * processes))
-    threads = need.threads or max(cores // processes, 1)
-    if threads * processes > cores:
+    processes = settings["processes"] or 1
+    cores = settings["cores"] or (need.threads or JOB_CORES) * processes
+    threads = need.threads or cores // processes
+    if threads * processes > cores or threads < 1:
         raise InputError(
-            f"{path}: {kind}: cores: expected at least {threads * processes} for {processes} tasks "
-            f"of {threads} threads, got {cores}; lower processes or `threads`"
+            f"{path}: {kind}: cores: expected at least {max(threads, 1) * processes} for {processes} tasks "
+            f"of {max(threads, 1)} threads, got {cores}; lower processes or `threads`"
         )
     least = need.limit_for(need.task_bytes) * processes
-    n_bytes = asked_for = need.limit_for(MEMORY_MARGIN * need.task_bytes) * processes
-    for key, n_bytes in numbers.items():
-        if n_bytes < least:
-            raise InputError(
-                f"{path}: {kind}: {key}: expected at least {memory_words(least)} for {processes} of the largest "
-                f"tasks at a time, got {settings[key]}; leave it out, and jobs ask for what tasks need"
-            )
+    asked_for = need.limit_for(MEMORY_MARGIN * need.task_bytes) * processes
+    n_bytes = asked_for
+    for key in ("memory", "job-mem", "mem"):  # for dask; what SLURM and LSF are asked for instead
+        if settings.get(key) is not None:
+            n_bytes = _bytes_of(f"{path}: {kind}: {key}", settings[key])
+            if n_bytes < least:
+                raise InputError(
+                    f"{path}: {kind}: {key}: expected at least {memory_words(least)} for {processes} of the largest "
+                    f"tasks at a time, got {settings[key]}; leave it out, and jobs ask for what tasks need"
+                )
     if (name := MEMORY_KEYS.get(kind)) is not None and settings[name] is None:
         raise InputError(
             f"{path}: {kind}: expected {name}, by which a job asks for {memory_words(asked_for)} here "
@@ -357,6 +333,66 @@ def _kinds() -> dict[str, Any]:
     return {cluster.job_cls.config_name: cluster for cluster in clusters}
 
 
+@cache
+def _defaults() -> dict[str, dict[str, Any]]:
+    """The keys of each system with their defaults, as dask-jobqueue comes with them."""
+    import yaml
+
+    return yaml.safe_load(files("dask_jobqueue").joinpath("jobqueue.yaml").read_text(encoding="utf-8"))["jobqueue"]
+
+
+def _yaml_of(path: Path) -> Any:
+    import yaml
+
+    text = text_of(path, "file of dask-jobqueue's configuration")
+    for most, count, noun in (
+        (YAML_LETTERS, len(text), "letters"),
+        (YAML_BRACKETS, text.count("[") + text.count("{"), "brackets"),
+    ):
+        if count > most:
+            raise InputError(f"{path}: expected at most {most} {noun} of YAML, got {count}")
+    try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise InputError(
+                f"{path}: expected YAML without aliases (*name), which may stand for any amount; write it out"
+            )
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: expected YAML, got {_short(error)}; mend that place") from error
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: expected YAML, got {_short(error)}") from error
+
+
+def _check_value(what: str, key: str, value: Any, default: Any) -> None:
+    """InputError where a value is of another type than its key's."""
+    if key == "walltime" and not isinstance(value, str):
+        raise InputError(
+            f'{what}: expected it in quotes, as "12:00:00" (without, YAML reads seconds), got {_short(value)}'
+        )
+    if key in ("cores", "processes") and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise InputError(f"{what}: expected a whole number above 0, got {_short(value)}")
+    if key == "memory":
+        _bytes_of(what, value)
+    if isinstance(default, list) and not (isinstance(value, list) and all(isinstance(item, str) for item in value)):
+        raise InputError(f"{what}: expected a list of texts, got {_short(value)}")
+    if isinstance(default, dict) and not isinstance(value, dict):
+        raise InputError(f"{what}: expected keys with their values, got {_short(value)}")
+    if not isinstance(default, list | dict) and isinstance(value, list | dict):
+        raise InputError(f"{what}: expected one value, got {_short(value)}")
+
+
+def _bytes_of(what: str, value: Any) -> float:
+    from dask.utils import parse_bytes
+
+    try:
+        n_bytes = float(parse_bytes(value)) if isinstance(value, str | int) and not isinstance(value, bool) else -1.0
+    except (ValueError, OverflowError):
+        n_bytes = -1.0
+    if not n_bytes > 0.0:
+        raise InputError(f'{what}: expected memory, as "8 GB", got {_short(value)}')
+    return n_bytes
+
+
 @contextmanager
 def _refused(what: str) -> Iterator[None]:
     """InputError of one line for what dask-jobqueue raises, or a command of the batch system that it calls says."""
@@ -364,11 +400,6 @@ def _refused(what: str) -> Iterator[None]:
         yield
     except (ValueError, TypeError, OSError, RuntimeError) as error:
         raise InputError(f"{what}: {_short(str(error).split('stderr:')[-1])}") from error
-
-
-def _shown(value: Any) -> str:
-    """A value of a configuration, however deep it is."""
-    return _short(value if isinstance(value, str) else reprlib.repr(value))
 
 
 def _short(text: Any) -> str:

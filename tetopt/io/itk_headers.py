@@ -1,7 +1,7 @@
 """The headers of NRRD and MetaImage, read here before SimpleITK reads the file: sizes, and which file has the voxels.
 
-A header may name any file of the machine, whose bytes become voxels of the mesh that goes back to its sender. What
-else is wrong with one, SimpleITK finds, in a child with limits.
+ITK takes what they tell: ``NDims = -1`` ends the process, sizes are allocated before the file is found to be too short,
+and a header may name any file of the machine, whose bytes become voxels of the mesh that goes back to its sender.
 """
 
 from __future__ import annotations
@@ -19,26 +19,15 @@ from tetopt.system.incoming import irregular
 HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers are read here
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
+TEXT_RATIO = 4  # "0 " becomes 8 bytes
 VALUE_LETTERS = 32  # of text, for a byte of a value at most
-# Of a value, by words in the names of its type; the first that fits.
-VALUE_BYTES = {"char|int8": 1, "short|int16": 2, "long.?long|double|64": 8, "": 4}
 BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
+VALUE_BYTES = {  # of NRRD's words without "unsigned" and the like, and MetaImage's likewise
+    "char": 1, "int8": 1, "int8_t": 1, "short": 2, "short int": 2, "int16": 2, "int16_t": 2, "int": 4, "int32": 4,
+    "int32_t": 4, "long": 4, "longlong": 8, "long long": 8, "long long int": 8, "int64": 8, "int64_t": 8, "float": 4,
+    "double": 8,
+}  # fmt: skip
 READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompressed .nii, of which parts are read"
-
-
-class _Words(NamedTuple):
-    """What a format calls the fields that matter here."""
-
-    mark: str  # between name and value
-    axes: str
-    sizes: str
-    kind: str
-    data: str
-    skip: str
-
-
-NRRD = _Words(":", "dimension", "sizes", "type", "datafile", "byteskip")
-META_IMAGE = _Words("=", "NDims", "DimSize", "ElementType", "ElementDataFile", "HeaderSize")
 
 
 class VoxelHeader(NamedTuple):
@@ -48,7 +37,8 @@ class VoxelHeader(NamedTuple):
     value_bytes: int  # all voxels
     files: list[str]  # that have the voxels; none if they follow the header
     ratio: int  # the most that a byte of the file can become
-    is_skipping: bool  # whether any number of bytes lies before the voxels
+    skip: str  # bytes before the voxels, as it is written; -1 if the voxels are the last
+    n_bytes: int  # of the header itself, where voxels follow
 
 
 def checked_header(path: Path) -> tuple[int, int]:
@@ -57,19 +47,30 @@ def checked_header(path: Path) -> tuple[int, int]:
     Raises
     ------
     InputError
-        Without the path before it: a header that cannot be read, or tells of more than memory or the files can
-        have, or of far less; a data file that is not beside the header, or no regular file.
+        Without the path before it: a header that cannot be read or tells of more than the files have; a data file that
+        is not beside the header, or no regular file.
     """
     header = _header(path)
-    n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
+    n_bytes = _checked_bytes(path, header)
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1), READ_IN_PARTS)
-    if header.value_bytes > n_bytes * header.ratio:  # ITK takes what is missing of packed voxels for 0
-        sizes = " x ".join(map(str, header.sizes))
-        raise InputError(f"{DAMAGED_FILE} (its header tells of {sizes} voxels, the file has {n_bytes} bytes)")
-    most = VALUE_LETTERS * header.value_bytes + TRAILING_BYTES
-    if n_bytes > most and not header.is_skipping:  # its checksum would be made of all of it
-        raise InputError(TOO_LONG.format(most))
     return n_bytes, header.value_bytes
+
+
+def _checked_bytes(path: Path, header: VoxelHeader) -> int:
+    """Bytes of all files of the image; InputError if its header tells of more, or of far fewer."""
+    n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
+    if header.value_bytes > n_bytes * header.ratio:
+        sizes = " x ".join(str(size) for size in header.sizes)
+        raise InputError(
+            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
+            f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
+        )
+    longest = VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
+    skipped = int(header.skip) if header.skip.isdecimal() else 0
+    most = header.n_bytes + skipped + longest * header.value_bytes + TRAILING_BYTES
+    if n_bytes > most:  # its checksum would be made of all of it
+        raise InputError(TOO_LONG.format(most))
+    return n_bytes
 
 
 def data_files(path: Path) -> list[Path]:
@@ -88,6 +89,15 @@ def header_sizes(path: Path) -> tuple[int, ...]:
     return tuple(_header(path).sizes)
 
 
+def _header(path: Path) -> VoxelHeader:
+    with path.open("rb") as stream:
+        head = stream.read(HEADER_BYTES)
+    header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    if header.files and len(head) == HEADER_BYTES:  # what follows might name others
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes, its voxels elsewhere)")
+    return header
+
+
 def _check_beside(path: Path, name: str) -> None:
     """InputError unless the name is that of a regular file in the header's folder."""
     if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
@@ -100,54 +110,90 @@ def _check_beside(path: Path, name: str) -> None:
         raise InputError(f'its data file "{name}" is {other}; expected a regular file')
 
 
-def _header(path: Path) -> VoxelHeader:
-    with path.open("rb") as stream:
-        head = stream.read(HEADER_BYTES)
-    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
-    if is_nrrd and not head.startswith(b"NRRD"):
-        raise InputError(UNREADABLE_FILE)
-    words = NRRD if is_nrrd else META_IMAGE
-    lines = [line.rstrip("\r") for line in head.decode("latin-1").split("\n")]
-    fields, files = _fields(lines[is_nrrd:], words)
-    if len(head) == HEADER_BYTES and (files or (is_nrrd and "" not in lines)):  # what follows might name others
-        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes)")
-    for key in (words.axes, words.sizes, words.kind, "encoding" if is_nrrd else words.data):
-        if key not in fields:
-            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
-    sizes, channels = fields[words.sizes].split(), fields.get("ElementNumberOfChannels", "1")
-    if not all(re.fullmatch(r"\d{1,18}", each) for each in (*sizes, channels)):
-        raise InputError(f"{UNREADABLE_FILE} (sizes {fields[words.sizes][:80]}, {channels[:20]} channels)")
-    if fields[words.axes] != str(len(sizes)) or not 0 < len(sizes) <= MOST_AXES:
-        raise InputError(
-            f"{UNREADABLE_FILE} (expected 1 to {MOST_AXES} axes, with a size each, got {fields[words.axes][:80]} axes "
-            f"and {len(sizes)} sizes)"
-        )
-    item = next(n for names, n in VALUE_BYTES.items() if re.search(names, fields[words.kind].lower()))
-    value_bytes = math.prod(map(int, sizes)) * int(channels) * item
-    ratio = BZIP2_RATIO if fields.get("encoding", "").lower() in ("bz2", "bzip2") else DEFLATE_RATIO
-    return VoxelHeader([*map(int, sizes)], value_bytes, files, ratio, fields.get(words.skip, "0") != "0")
+def _sizes(text: str, n_axes: int) -> list[int]:
+    """Lengths of the axes."""
+    words = text.split()
+    if len(words) != n_axes or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
+        raise InputError(f"{UNREADABLE_FILE} (expected {n_axes} sizes, got {text[:80]})")
+    return [int(word) for word in words]
 
 
-def _fields(lines: list[str], words: _Words) -> tuple[dict[str, str], list[str]]:
-    """What a header's fields say, by name, and the files that have the voxels."""
+def _n_axes(text: str) -> int:
+    if re.fullmatch(r"\d{1,3}", text) is None or not 1 <= int(text) <= MOST_AXES:
+        raise InputError(f"{UNREADABLE_FILE} (expected 1 to {MOST_AXES} axes, got {text[:80]})")
+    return int(text)
+
+
+def _metaimage(head: bytes) -> VoxelHeader:
     fields: dict[str, str] = {}
     files: list[str] = []
-    for number, line in enumerate(lines, 1):
-        key, mark, value = line.partition(words.mark)
-        if words is NRRD:
-            if not line:
-                break
-            if line.startswith("#") or value.startswith("="):  # "key:=value"; of a field's value ":=" is a part
-                continue
-            key = key.lower().replace(" ", "")
-        elif (key.strip() and not mark) or ":" in key:  # which ITK takes for the end of a key, too
+    lines = head.split(b"\n")
+    for number, line in enumerate(lines):
+        key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
+        if (key and not equals) or ":" in key:  # which ITK takes for the end of a key, too
             raise InputError(UNREADABLE_FILE)
-        key, value = key.strip(), value.strip()
         fields[key] = value
-        if key == words.data and value.upper().startswith("LIST"):
-            return fields, files + [each.strip() for each in lines[number:] if each.strip()]
-        if key == words.data and (words is NRRD or value.upper() != "LOCAL"):
-            files.append(value)
-        if key == words.data and words is META_IMAGE:
+        if key == "ElementDataFile":
+            rest = [each.decode("latin-1").strip() for each in lines[number + 1 :]]
+            if value.upper().startswith("LIST"):
+                files = [each for each in rest if each]
+            elif value.upper() != "LOCAL":
+                files = [value]
             break
-    return fields, files
+    for key in ("NDims", "DimSize", "ElementType", "ElementDataFile"):
+        if key not in fields:
+            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
+    sizes = _sizes(fields["DimSize"], _n_axes(fields["NDims"]))
+    channels = fields.get("ElementNumberOfChannels", "1")
+    if re.fullmatch(r"\d{1,9}", channels) is None:
+        raise InputError(f"{UNREADABLE_FILE} (ElementNumberOfChannels = {channels[:80]})")
+    is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
+    is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
+    ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
+    value_bytes, end = math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]), lines[: number + 1]
+    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1)
+
+
+def _nrrd(head: bytes) -> VoxelHeader:
+    if not head.startswith(b"NRRD"):
+        raise InputError(UNREADABLE_FILE)
+    fields: dict[str, str] = {}
+    files: list[str] = []
+    raw = head.split(b"\n")
+    lines = [line.decode("latin-1").rstrip("\r") for line in raw]
+    if len(head) == HEADER_BYTES and "" not in lines:
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes)")
+    for number, line in enumerate(lines[1:], 1):
+        if not line:
+            break
+        key, _, value = line.partition(":")
+        if line.startswith("#") or value.startswith("="):  # "key:=value"; of a field's value ":=" is a part
+            continue
+        key, value = key.strip().lower(), value.strip()
+        fields[key] = value
+        if key in ("data file", "datafile"):
+            if value.upper().startswith("LIST"):
+                files += [each.strip() for each in lines[number + 1 :] if each.strip()]
+                break
+            files.append(value)
+    for key in ("dimension", "sizes", "type", "encoding"):
+        if key not in fields:
+            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
+    sizes = _sizes(fields["sizes"], _n_axes(fields["dimension"]))
+    encoding = fields["encoding"].lower()
+    ratio = BZIP2_RATIO
+    for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
+        if encoding in names.split():
+            ratio = of_these
+    value_bytes, skip = math.prod(sizes) * _value_bytes(fields["type"]), fields.get("byteskip", "0")
+    end = len(b"\n".join(raw[: number + 1])) + 1
+    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("byte skip", skip), end)
+
+
+def _value_bytes(kind: str) -> int:
+    """Bytes of a value of a type."""
+    name = kind[4:].replace("_", " ").lower() if kind.startswith("MET_") else kind
+    name = re.sub("^(unsigned |signed |u)", "", name)
+    if name not in VALUE_BYTES:
+        raise InputError(f"{UNREADABLE_FILE} (voxels of type {kind[:80]})")
+    return VALUE_BYTES[name]
