@@ -47,6 +47,7 @@ KINDS = {
 }
 FILES = {"mask", "labels", "start"}  # options that are files
 DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
+LONG = ("order 2", "target error", "parts")  # several runs each
 OF_FORMAT = {
     ".inp": {"young": "1 + 0.01*h", "loads": "compress:5%"},
     ".feb": {"young": "2", "loads": ["hold:superior"]},
@@ -109,7 +110,9 @@ def assert_equal_files(folder):
             assert command[name].read_bytes() == python[name].read_bytes(), name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.deep] if kind in LONG else []) for kind in KINDS]
+)
 def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, kind):
     code, result, events = both(inputs, tmp_path, monkeypatch, *KINDS[kind], is_drawn=kind in DRAWN)
     assert_equal_files(tmp_path)

@@ -381,7 +381,7 @@ def test_target_error(shape, noise):
     assert tetopt.check_mesh(mesh, image) == []
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_target_error_within_limits():
     """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
     image = ball(40, 40, 40)

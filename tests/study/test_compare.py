@@ -224,7 +224,7 @@ def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
     assert "options trade" not in (out / "report.html").read_text()
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_resume_keeps_what_is_done(run, head, undrawn, tmp_path, capsys):
     """Finished runs of the same settings are kept; a run taken away, or other settings, are run again, in children."""
     out = Path(shutil.copytree(run, tmp_path / "out"))
@@ -352,7 +352,7 @@ def test_what_lies_among_the_runs_and_is_not_tetopts_stays(head, tmp_path, capfd
     assert content(tmp_path) == before
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_pytetwild_in_the_comparison(head, undrawn, tmp_path):
     """The conventional pipeline beside one that never varies, repeated: node counts near the wish, the range."""
     pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
