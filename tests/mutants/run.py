@@ -69,7 +69,8 @@ def main() -> int:
     for path in lists:
         for mutant in tomllib.loads(path.read_text(encoding="utf-8"))["mutant"]:
             killed.append(is_killed(mutant))
-            print("killed  " if killed[-1] else "SURVIVED", mutant["file"], mutant["new"].strip().splitlines()[0][:80], flush=True)
+            line = next(iter(mutant["new"].strip().splitlines()), "(taken out)")
+            print("killed  " if killed[-1] else "SURVIVED", mutant["file"], line[:80], flush=True)
     print(f"{sum(killed)} of {len(killed)} mutants killed")
     return int(not all(killed))
 
