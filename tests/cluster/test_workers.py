@@ -311,6 +311,7 @@ def test_a_configuration_that_is_not_there_is_said_so(tmp_path):
 
 
 def requested(settings, need, kind="slurm"):
+    pytest.importorskip("dask_jobqueue")  # which tells dask its configuration
     return request(Path("c.yaml"), kind, dask.config.get(f"jobqueue.{kind}") | settings, need)
 
 
