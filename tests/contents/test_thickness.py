@@ -1,0 +1,66 @@
+"""The local thickness of labels: slabs, shells and balls of known size, in voxels of several shapes."""
+
+import numpy as np
+import pytest
+
+from tetopt.contents.memberships import finer, memberships, supersampling
+from tetopt.contents.thickness import local_thickness
+from tetopt.image import Image
+
+MOST = 12.0
+
+
+def thickness_of(data, spacing=(1.0, 1.0, 1.0), inside=None):
+    image = Image(data.astype(float), np.diag([*spacing[: data.ndim], 1.0]))
+    return local_thickness(memberships(image), image.spacing, MOST, inside)
+
+
+def radius(n, centre=0.13):
+    return np.linalg.norm(np.indices((n, n, n)) - 0.5 * (n - 1) + centre, axis=0)
+
+
+@pytest.mark.parametrize("size", [1.5, 2.0, 3.0, 5.0])
+def test_a_shell_is_as_thick_as_it_is(size):
+    r = radius(44)
+    shell = (r >= 14.0) & (r < 14.0 + size)
+    thickness = thickness_of(np.where(shell, 2, r < 14.0))
+    assert np.median(thickness[shell]) == pytest.approx(size, rel=0.08)
+    assert np.percentile(thickness[shell], 95) < 1.2 * size
+    assert np.median(thickness[r < 14.0]) == MOST  # what lies within is thicker than is looked at
+
+
+def test_a_slab_of_a_sloping_side_and_long_voxels():
+    x, y, _ = np.indices((30, 20, 12))
+    is_in = (y >= 8) & (y < 11)
+    assert np.median(thickness_of(is_in, (1.0, 2.0, 1.0))[is_in]) == pytest.approx(6.0, abs=0.1)
+    is_in = (x + y >= 20) & (x + y < 24)  # 4 / sqrt 2 thick
+    assert np.median(thickness_of(is_in)[is_in]) == pytest.approx(8.0**0.5, rel=0.06)
+
+
+def test_near_the_surface_of_a_ball_it_is_as_thick_as_in_the_middle():
+    r = radius(24)
+    thickness = thickness_of(r < 4.0)
+    near = (r > 2.5) & (r < 3.5)
+    assert np.percentile(thickness[near], 10) > 7.0
+    assert thickness[r < 4.0].max() == pytest.approx(8.0, rel=0.06)
+
+
+def test_a_region_ends_labels():
+    data, inside = np.ones((20, 16, 16)), np.zeros((20, 16, 16), dtype=bool)
+    data[:10] = 2
+    inside[7:17] = True
+    thickness = thickness_of(data, inside=inside)
+    assert np.unique(thickness[8]).tolist() == pytest.approx([3.0], abs=0.1)
+    assert np.median(thickness[12]) == pytest.approx(7.0, abs=0.1)
+    assert (thickness[~inside] == 0.0).all()
+
+
+def test_triangles_and_divided_slices():
+    y = np.indices((30, 30))[1]
+    is_in = (y >= 10) & (y < 14)
+    assert np.median(thickness_of(is_in)[is_in]) == pytest.approx(4.0, abs=0.05)
+    thick_slices = Image((np.indices((24, 24, 6))[0] // 6 == 1).astype(float), np.diag([1.0, 1.0, 5.0, 1.0]))
+    factors = supersampling(thick_slices.spacing)
+    fine = finer(thick_slices, factors)
+    thickness = local_thickness(memberships(thick_slices, factors), fine.spacing, MOST)
+    assert np.median(thickness[fine.data == 1.0]) == pytest.approx(6.0, abs=0.1)
