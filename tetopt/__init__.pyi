@@ -60,6 +60,12 @@ from .model.materials import BinningError as BinningError, Materials as Material
 from .model.model import Model as Model
 from .model.sets import Box as Box, Sets as Sets
 from .contents.phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
+from .start.label_sizes import (
+    LabelLayers as LabelLayers,
+    LabelSize as LabelSize,
+    SizesByLabel as SizesByLabel,
+    sizes_by_label as sizes_by_label,
+)
 from .start.lattice import lattice_mesh as lattice_mesh
 from .start.octree import octree_mesh as octree_mesh
 from .start.sizes import Sizes as Sizes

@@ -31,7 +31,8 @@ def solved(points, cells, labels, n_labels=2, components=None, weight=None, coun
     """`labelled` of cells that are full of one label each."""
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
     components = [np.array([1])] * n_labels if components is None else components
-    return labelled(points, cells, across_of(cells, len(points)), counts, components, weight)
+    bias = np.zeros(counts.shape[1])
+    return labelled(points, cells, across_of(cells, len(points)), counts, components, None, bias, weight)
 
 
 def lattice(n, cubes):
@@ -86,7 +87,7 @@ def test_what_is_not_manifold_as_the_twin(n):
         points, cells = box(n, 20, seed) if seed else lattice(n, 2)
         labels = rng.integers(0, 2 + seed, len(cells))
         counts = whole(labels, 4, volumes(points, cells))
-        dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None)
+        dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None, None)
         faces, is_two = labelling._nonmanifold(dual, labels)
         bad = {frozenset(int(i) for i in face if i >= 0): two for face, two in zip(faces, is_two, strict=True)}
         assert bad == {face: len(there) == 2 for face, there in naive.nonmanifold(cells, labels).items()}
@@ -100,7 +101,7 @@ def test_moves_lower_the_energy(n):
     rng = np.random.default_rng(5)
     points, cells = box(n, 40, 1)
     voxels = rng.random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.2)
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), None, 0.2)
     labels = voxels.argmax(axis=1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
 
@@ -125,7 +126,7 @@ def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
     points, cells = box(3, 12, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.1)
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), None, 0.1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
     labels = voxels.argmax(axis=1)
     number, of_component = components_of(dual.across, labels)

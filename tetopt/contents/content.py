@@ -58,6 +58,7 @@ class SmoothLabels(NamedTuple):
     tension: float  # voxels: how far an interface would move to save itself
     own_channel: NDArray[np.int64]  # (K,) each label's channel, a row of `values`
     own_value: NDArray[np.int32]  # (K,) what its voxels have there
+    keeps_volumes: bool  # whether labels thinner than cells keep their volume
 
 
 class Content(NamedTuple):
@@ -169,7 +170,7 @@ class Content(NamedTuple):
 def content(
     images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
-    keep_components: bool = False,
+    keep_components: bool = False, keep_volumes: bool = True,
 ) -> Content:  # fmt: skip
     """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree_mesh` or `optimize`.
 
@@ -194,6 +195,9 @@ def content(
         these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
     keep_components : bool
         Keep connected components of the mesh that the mask does not have. By default small ones are dropped.
+    keep_volumes : bool
+        Give labels that are thinner than cells as much volume as their voxels have, by cells of which other labels fill
+        more. With False they lose what cells do not show.
 
     Returns
     -------
@@ -257,7 +261,9 @@ def content(
     if members is None:
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)
-    return result._replace(smooth=SmoothLabels(members, smooth_interfaces, channel.astype(np.int64), value))
+    return result._replace(
+        smooth=SmoothLabels(members, smooth_interfaces, channel.astype(np.int64), value, keep_volumes)
+    )
 
 
 def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Region:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import check_labels, label_channels
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
+from tetopt.system.kernel_cache import njit
 
 PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
 NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then
@@ -134,6 +135,48 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     if off.any():
         _merge_crumbs(levels, partition, channel, off == 0.0)
     return Memberships(values, channel, levels, partition, prod(factors))
+
+
+def labels_at(members: Memberships, index: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rows of the labels whose levels are smallest at index positions (P, n); (P,)."""
+    shape = (1,) * (3 - index.shape[1]) + members.partition.shape
+    place = np.zeros((len(index), 3))
+    place[:, 3 - index.shape[1] :] = index
+    return np.asarray(
+        _labels_at(
+            members.partition.reshape(shape), members.levels.reshape(-1, *shape), members.channel,
+            np.clip(place, 0.0, np.array(shape) - 1.0),
+        )
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _labels_at(partition: NDArray, levels: NDArray, channel: NDArray, index: NDArray) -> NDArray:
+    """The label of the smallest level among those of the voxels around each position."""
+    row, corner, weight = np.empty(len(index), dtype=np.int64), np.empty((8, 3), dtype=np.int64), np.empty(8)
+    for p in range(len(index)):
+        is_same = True
+        for m in range(8):
+            weight[m] = 1.0
+            for d in range(3):
+                low = min(int(index[p, d]), max(partition.shape[d] - 2, 0))
+                fraction = index[p, d] - low
+                is_high = m >> d & 1
+                corner[m, d] = min(low + is_high, partition.shape[d] - 1)
+                weight[m] *= fraction if is_high else 1.0 - fraction
+            is_same &= (
+                partition[corner[m, 0], corner[m, 1], corner[m, 2]]
+                == (partition[corner[0, 0], corner[0, 1], corner[0, 2]])
+            )
+        best, least = partition[corner[0, 0], corner[0, 1], corner[0, 2]], np.inf
+        for m in range(8 * (not is_same)):
+            label, level = partition[corner[m, 0], corner[m, 1], corner[m, 2]], 0.0
+            for q in range(8):
+                level += weight[q] * levels[channel[label], corner[q, 0], corner[q, 1], corner[q, 2]]
+            if level < least or (level == least and label < best):
+                best, least = label, level
+        row[p] = best
+    return row
 
 
 def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:

@@ -77,6 +77,7 @@ class Objective(NamedTuple):
     n_means: int  # the first channels, of which a cell has its mean; of the others it has what its label says
     own_column: Ints1  # (K,) for each label the column of a cell's sums that is its channel's
     own_value: Floats1  # (K,) and its value there; 0 in the other channels of labels
+    bias: Floats1  # (K,) what a label is worth besides, as a fraction of a cell's voxels; see `tetopt.engine.labelling`
     tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 

@@ -23,7 +23,8 @@ from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_stars, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.interfaces import mend_pinches, relabel, with_labels
+from tetopt.engine.interfaces import mend_pinches, relabel, with_balance, with_labels
+from tetopt.engine.labelling import voxel_components
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
     SHAPE_POWER,
@@ -59,6 +60,7 @@ EXCHANGING_FRACTION = 0.7  # of the iterations: the first ones, in which nodes a
 EXCHANGED_FRACTION = 0.1  # of the requested nodes: the most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
 LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
+LABELLED_EVERY = 2  # iterations: again from there on, before exchanges
 LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
 # degrees: cells may be as flat, if `min_dihedral` is no lower, until nodes are between labels
 ATTRACTED_MIN_DIHEDRAL = 4.0
@@ -218,7 +220,8 @@ def followed(
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
     for iteration in range(course.first, course.last + 1):
         before = run.state.complex.ticks.copy()
-        if has_labels and iteration == min(LABELLED_AT, course.iterations):
+        is_labelled = has_labels and gives_labels(iteration, course)
+        if is_labelled:
             run.give_labels()
         if run.has_labels:
             run.attract(min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral)
@@ -229,7 +232,7 @@ def followed(
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
-        is_new = has_labels and iteration <= LABELLED_AT  # E is another one from then on: nothing has settled yet
+        is_new = is_labelled or (has_labels and not run.has_labels)  # E is another one: nothing has settled yet
         fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         # 3. Exchange nodes: in every other one of the first iterations.
         if nodes is not None and does_exchange:
@@ -246,6 +249,15 @@ def followed(
         if is_last and fall < course.tolerance:
             return history, "converged"
     return history, "iterations"
+
+
+def gives_labels(iteration: int, course: Course) -> bool:
+    """Whether cells get labels from the voxels: first in `LABELLED_AT`, and again as nodes are exchanged.
+
+    In between labels keep their topology. Given once, holes of a sheet would stay that cells were too large for.
+    """
+    first = min(LABELLED_AT, course.iterations)
+    return iteration == first or (first < iteration <= course.n_early and (iteration - first) % LABELLED_EVERY == 0)
 
 
 def prepare_kernels(
@@ -301,6 +313,7 @@ class Run:
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
+        self.components: list[NDArray] = []  # voxels in those of each label, once they are needed
         # Its variance, estimated when it is first needed.
         self.image_noise: float | None = None if whole is None else whole.noise
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
@@ -392,7 +405,10 @@ class Run:
         """Give each cell a label, if the content has any, and let nodes between labels slide from now on."""
         if self.content.smooth is None:
             return
-        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh())
+        members = self.content.smooth.memberships
+        if not self.components:
+            self.components = voxel_components(members.partition, len(members.labels))
+        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.components)
         self.has_labels = True
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
@@ -403,6 +419,7 @@ class Run:
         No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none below the minimum.
         """
         ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
+        self.state = with_balance(self.state, self.content, self.mesh())
         relabel(self.state)
         lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:

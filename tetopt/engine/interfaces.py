@@ -7,41 +7,66 @@ leaves both labels' topology as it is.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, SmoothLabels
-from tetopt.contents.memberships import Memberships
+from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
-from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_components
+from tetopt.engine.labelling import (
+    Contacts,
+    balanced,
+    contacts_of,
+    keeps_topology,
+    labelled,
+    unpinched,
+    voxel_components,
+)
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
-from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.kernels import Floats1, Ints1, entry, helper, unit
 
+FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
+SAMPLED_AT_ONCE = 100_000  # cells: 50 MB of places
+BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
+SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
 RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
 LEAST_RELABELLING_FRACTION = 1e-9  # of the energies weighed: a smaller gain may be rounding
 
 
-def with_labels(state: State, content: Content, smooth: SmoothLabels, mesh: Mesh) -> State:
-    """The state with a label for each cell, of the content's, and an objective that counts what is not of it."""
-    members, tension, own_channel, own_value = smooth
-    components = voxel_components(members.partition, len(members.labels))
+def with_labels(
+    state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, components: list[NDArray] | None = None
+) -> State:
+    """The state with a label for each cell, of the content's, and an objective that counts what is not of it.
+
+    `components` are those of the labels' voxels (`voxel_components`), if they are known. Labels that cells have already
+    say what volume each label has lost or won, and its bias is brought up to date.
+    """
+    members, tension, own_channel, own_value, keeps_volumes = smooth
+    bias = None if keeps_volumes else np.zeros(len(members.labels))
+    components = components or voxel_components(members.partition, len(members.labels))
+    if len(state.objective.bias) > 0:
+        state = with_balance(state, content, mesh)
+        bias = state.objective.bias
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
-    state.complex.labels[:n_cells] = labelled(
-        mesh.points, mesh.cells, across, cell_counts(image, members, mesh), components
-    ).labels
+    counts, contacts = cell_contents(image, members, mesh)
+    made = labelled(mesh.points, mesh.cells, across, counts, components, contacts, bias)
+    state.complex.labels[:n_cells] = made.labels
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
+        bias=made.bias,
         tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
@@ -50,28 +75,61 @@ def with_labels(state: State, content: Content, smooth: SmoothLabels, mesh: Mesh
     return state
 
 
+def with_balance(state: State, content: Content, mesh: Mesh) -> State:
+    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are kept."""
+    if content.smooth is None or not content.smooth.keeps_volumes:
+        return state
+    members = content.smooth.memberships
+    rows = members.partition if content.inside is None else members.partition[content.inside]
+    aim = content.image.voxel_volume * np.bincount(rows.ravel(), minlength=len(members.labels))
+    size = np.abs(volumes(mesh.points, mesh.cells))
+    volume = np.bincount(state.complex.labels[: len(size)], size, len(members.labels))
+    is_small = np.abs(volume - aim) < SMALL_LOSS_FRACTION * aim
+    bias = balanced(np.where(is_small, BALANCE_LEAK, 1.0) * state.objective.bias, aim, volume)
+    return state._replace(objective=state.objective._replace(bias=bias))
+
+
 def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh) -> None:
     """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
-        labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(image, members, mesh), labels)
+        labels[:] = unpinched(mesh.points, mesh.cells, across, *cell_contents(image, members, mesh), labels)
         _meet_everywhere(state, node_stars(state))
 
 
-def cell_counts(image: Image, members: Memberships, mesh: Mesh) -> scipy.sparse.csr_array:
-    """Voxels of each label in each cell, (M, K); of a cell without voxels its size in those of its centroid's label."""
-    partition = members.partition
-    owner, n_labels = cell_of_voxel(image, mesh).ravel(), len(members.labels)
-    is_in, shape = owner >= 0, (len(mesh.cells), n_labels)
-    counts = scipy.sparse.csr_array((np.ones(int(is_in.sum())), (owner[is_in], partition.ravel()[is_in])), shape=shape)
-    empty = np.flatnonzero(counts.sum(axis=1) == 0.0)
-    nearest = np.rint(image.to_index(centroids(mesh.points, mesh.cells[empty]))).astype(np.int64)
-    nearest = np.clip(nearest, 0, np.array(image.shape) - 1)
-    size = volumes(mesh.points, mesh.cells[empty]) / image.voxel_volume
-    counts = counts + scipy.sparse.csr_array((size, (empty, partition[tuple(nearest.T)])), shape=shape)
-    counts.sum_duplicates()
-    return counts
+def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy.sparse.csr_array, Contacts]:
+    """Voxels of each label in each cell, (M, K), and where labels touch; by samples where a cell holds few centres.
+
+    A cell of a thin sheet may hold one centre, or none. What is sampled are the levels, at the centres of equal parts.
+    """
+    shape = len(mesh.cells), len(members.labels)
+    owner = cell_of_voxel(image, mesh)
+    contacts = contacts_of(members.partition, image.spacing, shape[1], owner, shape[0])
+    owner = owner.ravel()
+    n_owned = np.bincount(owner[owner >= 0], minlength=shape[0])
+    is_sampled = n_owned < FEWEST_CENTRES
+    is_counted = owner >= 0
+    is_counted[is_counted] = ~is_sampled[owner[is_counted]]
+    cell, row, weight = [owner[is_counted]], [members.partition.ravel()[is_counted]], [np.ones(is_counted.sum())]
+    for part in np.array_split(np.flatnonzero(is_sampled), 1 + is_sampled.sum() // SAMPLED_AT_ONCE):
+        inner = SAMPLES[image.ndim]
+        corners = mesh.points[mesh.cells[part]]
+        row.append(labels_at(members, image.to_index((inner @ corners).reshape(-1, image.ndim))))
+        cell.append(np.repeat(part, len(inner)))
+        size = np.abs(volumes(mesh.points, mesh.cells[part])) / image.voxel_volume
+        weight.append(np.repeat(size / len(inner), len(inner)))
+    every = np.concatenate(weight), (np.concatenate(cell), np.concatenate(row))
+    return scipy.sparse.csr_array(every, shape=shape), contacts
+
+
+def _samples(n: int, parts: int) -> NDArray[np.float64]:
+    """Barycentric places (S, n+1), of the simplex's points that divide its edges into parts those moved inside."""
+    whole = np.array([each for each in itertools.product(range(parts + 1), repeat=n + 1) if sum(each) == parts])
+    return (whole + 0.5) / (parts + 0.5 * (n + 1))
+
+
+SAMPLES = {2: _samples(2, 4), 3: _samples(3, 3)}  # 15 and 20 places
 
 
 def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
@@ -144,7 +202,10 @@ def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) ->
             continue
         if own < 0.0:
             own = _price(state, cell, mesh.labels[cell])
-        more = own - _price(state, cell, mesh.labels[other])
+        objective, new, old = state.objective, mesh.labels[other], mesh.labels[cell]
+        squares = objective.own_value[new] ** 2 + objective.own_value[old] ** 2
+        favour = (objective.bias[new] - objective.bias[old]) * squares * objective.image * mesh.sums[cell, 0]
+        more = own - _price(state, cell, new) + favour
         if more > max(gain[cell], LEAST_RELABELLING_FRACTION * own):
             gain[cell], label[cell] = more, mesh.labels[other]
 

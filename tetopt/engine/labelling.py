@@ -3,10 +3,14 @@
 The labels minimise a Potts energy on the dual graph of a mesh that stays as it is (Boykov, Veksler, Zabih 2001),
 
     sum over cells of the volume of voxels that are not of the cell's label
+    - sum over cells of the bias of the cell's label x its volume
     + sum over facets between cells of different labels of tension x area,
 
 a surface tension in mm: how far a surface would move to save itself. A ball smaller than three of it in radius, or a
-sheet thinner than two, costs more than it is worth. From the labels that most voxels of each cell have, cells take
+sheet thinner than two, costs more than it is worth. A label that is thinner than cells has most of the voxels in few
+of them: its bias, one number, is raised until its cells have its volume. Between labels that touch nowhere in the
+voxels, or at a few places, the tension is higher: cells between them get the label of the sheet that parts them there,
+rather than tear it. From the labels that most voxels of each cell have, cells take
 the label of a neighbour, the best move first, as long as the energy falls. Then components of cells that no component
 of voxels justifies go to their neighbours, and what is not manifold is mended by the cells around it that cost least.
 
@@ -26,7 +30,7 @@ from numpy.typing import NDArray
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
 from tetopt.geometry.topology import linked, stars
-from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
+from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_FRACTION = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
@@ -39,7 +43,23 @@ BRIDGE_RATIO = 3.0  # of the voxels lost with a component: what a bridge may cos
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
 TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: what is not manifold between two labels goes at any cost
 MORE_LABELS_WEIGHT = 0.3  # where more labels meet: edges go with it, and with 4 a tenth of small organs' Dice, too
+APART_TENSION = 10.0  # times the usual, between labels that the voxels there keep apart
+PLACE_TENSION = 3.0  # likewise, where they touch
+APART_WEIGHT = 10.0  # where such labels meet at a node or an edge alone: a sheet between them is pierced
+LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs that touch less do so at places, not everywhere
+BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more hardly change it
+BALANCE_STEP = 20.0  # times the square of the fraction of its volume that a label lacks: its bias rises so much,
+LONGEST_BALANCE_STEP = 0.15  # at most,
+FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known. By the square, as facets alone cost what is round 1 %
+MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
+
+
+class Contacts(NamedTuple):
+    """Which labels touch in the voxels; made by `contacts_of`."""
+
+    is_apart: Bools2  # (K, K) pairs that do not touch, or at few places alone
+    is_place: Bools1  # (M,) cells that have a voxel at such a place
 
 
 class Labelling(NamedTuple):
@@ -51,6 +71,7 @@ class Labelling(NamedTuple):
     n_nonmanifold_nodes: int
     components: NDArray[np.int64]  # (K,) components of cells, linked by facets
     lost: NDArray[np.int64]  # labels with voxels but without cells
+    bias: NDArray[np.float64]  # (K,) of labels, with which they were found
 
 
 class Dual(NamedTuple):
@@ -66,11 +87,14 @@ class Dual(NamedTuple):
     first: Ints1  # (M+1,) where each cell's row of voxels begins
     row: Ints1  # labels in it
     volume: Floats1  # of their voxels in it, mm^n
+    contacts: Contacts
+    bias: Floats1  # (K,) what each label is worth besides, by volume; see `labelled`
 
 
 def labelled(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
-    components: list[NDArray], weight: float | None = None,
+    components: list[NDArray], contacts: Contacts | None = None, bias: NDArray[np.float64] | None = None,
+    weight: float | None = None,
 ) -> Labelling:  # fmt: skip
     """The label of each cell of a mesh: close to the voxels in it, interfaces short and manifold, no fragments.
 
@@ -89,6 +113,11 @@ def labelled(
         Voxels of each label in each cell, with fractions of a voxel where a cell holds no centre. No row is empty.
     components : list of K arrays
         Voxels in each component of each label, falling: `voxel_components`. As many components of cells may stay.
+    contacts : Contacts, optional
+        Which labels the voxels keep apart; none by default.
+    bias : (K,) float64, optional
+        What each label is worth besides, as a fraction of a cell's volume; by default what keeps the labels' volumes,
+        as far as it can: a label that is thinner than cells has most of the voxels in few of them.
     weight : float, optional
         Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
@@ -96,10 +125,13 @@ def labelled(
     -------
     Labelling
     """
-    dual, n_labels = _dual(points, cells, across, counts, weight), counts.shape[1]
+    dual, n_labels = _dual(points, cells, across, counts, contacts, weight), counts.shape[1]
+    voxel = float(dual.volume.sum() / counts.sum())
+    aim = np.bincount(dual.row, dual.volume, n_labels).astype(np.float64)
+    least = LEAST_FRACTION * aim
     begin = _majority(dual)
-    labels, voxel = begin.copy(), float(dual.volume.sum() / counts.sum())
-    least = (LEAST_FRACTION * np.bincount(dual.row, dual.volume, n_labels)).astype(np.float64)
+    dual.bias[:] = _balance(dual, aim, least) if bias is None else bias
+    labels = _majority(dual)
     _settle(dual, labels, least, False)
     is_bridge = np.zeros(len(labels), dtype=bool)
     for _ in range(MENDING_ROUNDS):
@@ -111,28 +143,50 @@ def labelled(
     _mend_pairs(dual, labels, LAST_FRACTION * least)
     faces, is_two = _nonmanifold(dual, labels)
     _, of_component = components_of(across, labels)
-    present = np.bincount(dual.row, dual.volume, n_labels) > 0.0
     return Labelling(
         labels,
         int((labels != begin).sum()),
         int((is_two & (faces[:, 1] >= 0)).sum()),
         int((is_two & (faces[:, 1] < 0)).sum()),
         np.bincount(of_component, minlength=n_labels),
-        np.flatnonzero(present & (np.bincount(labels, minlength=n_labels) == 0)),
+        np.flatnonzero((aim > 0.0) & (np.bincount(labels, minlength=n_labels) == 0)),
+        dual.bias,
     )
 
 
 def unpinched(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
-    labels: NDArray[np.int64],
+    contacts: Contacts | None, labels: NDArray[np.int64],
 ) -> NDArray[np.int64]:  # fmt: skip
     """Labels of cells, (M,), with as few changed as make interfaces of two labels manifold, whatever they cost.
 
     Arguments as of `labelled`; no label loses its last cell. What cannot be mended is left.
     """
-    dual, labels = _dual(points, cells, across, counts, None), labels.copy()
+    dual, labels = _dual(points, cells, across, counts, contacts, None), labels.copy()
     _mend_pairs(dual, labels, np.full(counts.shape[1], float(dual.size.min())))
     return labels
+
+
+def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far."""
+    longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
+    for _ in range(BALANCE_ROUNDS):
+        labels = _majority(dual)
+        _settle(dual, labels, least, False)
+        step = balanced(dual.bias, aim, np.bincount(labels, dual.size, len(aim)), longest) - dual.bias
+        longest = np.where(step * before < 0.0, 0.5 * longest, longest)
+        before = np.clip(step, -longest, longest)
+        dual.bias[:] += before
+    return dual.bias
+
+
+def balanced(
+    bias: NDArray[np.float64], aim: NDArray, volume: NDArray, longest: NDArray | float = LONGEST_BALANCE_STEP
+) -> NDArray[np.float64]:
+    """The bias of each label, raised where its volume is below its aim, lowered where it is above; all (K,)."""
+    missing = np.where(aim > 0.0, 1.0 - volume / np.where(aim > 0.0, aim, 1.0), 0.0)
+    step = np.clip(BALANCE_STEP * missing * np.abs(missing), -longest, longest)
+    return np.asarray(np.clip(bias + step, -MOST_BIAS, MOST_BIAS))
 
 
 def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
@@ -140,6 +194,32 @@ def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArra
     boxes = scipy.ndimage.find_objects(partition + 1, n_labels)
     parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
     return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
+
+
+def contacts_of(
+    partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int, owner: NDArray[np.int64], n_cells: int
+) -> Contacts:
+    """Which labels touch in the voxels of a grid: hardly any area of some pairs, and then in which cells.
+
+    `owner` is the cell of each voxel, or -1.
+    """
+    steps = [
+        (np.moveaxis(partition, d, 0), np.moveaxis(owner, d, 0), float(np.prod(spacing) / spacing[d]))
+        for d in range(partition.ndim)
+    ]
+    area = np.zeros(n_labels * n_labels)
+    for rows, _, face in steps:
+        area += face * np.bincount((n_labels * rows[:-1] + rows[1:]).ravel(), minlength=len(area))
+    area = area.reshape(n_labels, n_labels) + area.reshape(n_labels, n_labels).T
+    np.fill_diagonal(area, 0.0)
+    surface = area.sum(axis=1)
+    is_apart = area < LEAST_CONTACT_FRACTION * np.minimum(surface[:, None], surface)
+    np.fill_diagonal(is_apart, False)
+    is_place = np.zeros(n_cells + 1, dtype=bool)
+    for rows, cells, _ in steps:
+        is_met = is_apart[rows[:-1], rows[1:]]
+        is_place[cells[:-1][is_met]] = is_place[cells[1:][is_met]] = True
+    return Contacts(is_apart, is_place[:-1].copy())
 
 
 def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -155,10 +235,10 @@ def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple
 
 def _dual(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
-    weight: float | None,
+    contacts: Contacts | None, weight: float | None,
 ) -> Dual:  # fmt: skip
     assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no fraction of any label"
-    n = points.shape[1]
+    n, n_labels = points.shape[1], counts.shape[1]
     size, around = np.abs(volumes(points, cells)), stars(cells, len(points))
     scale = np.add.reduceat(np.append(size[around.cells], 0.0), around.start[:-1]) / np.maximum(
         np.diff(around.start), 1
@@ -181,13 +261,18 @@ def _dual(
         counts.indptr.astype(np.int64),
         counts.indices.astype(np.int64),
         voxel * counts.data.astype(np.float64),
+        Contacts(np.zeros((n_labels, n_labels), dtype=bool), np.zeros(len(cells), dtype=bool))
+        if contacts is None
+        else contacts,
+        np.zeros(n_labels),
     )
 
 
 def _majority(dual: Dual) -> NDArray[np.int64]:
     """The label that most voxels of each cell have, of equally many the first."""
     cell = np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
-    order = np.lexsort((dual.row, -dual.volume, cell))
+    worth = dual.volume + dual.bias[dual.row] * dual.size[cell]
+    order = np.lexsort((dual.row, -worth, cell))
     return dual.row[order[dual.first[:-1]]]
 
 
@@ -220,11 +305,14 @@ def _voxels(dual: Dual, cell: int, label: int) -> float:
 @unit
 def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
     """The part of the energy that a cell's label decides, less what it is at best, if its label were this."""
-    price = -_voxels(dual, cell, label)
+    price = -_voxels(dual, cell, label) - dual.bias[label] * dual.size[cell]
     for k in range(dual.across.shape[1]):
         other = dual.across[cell, k]
         if other >= 0 and labels[other] != label:
-            price += dual.tension[cell, k]
+            is_apart = dual.contacts.is_apart[label, labels[other]]
+            is_place = dual.contacts.is_place[cell] or dual.contacts.is_place[other]
+            factor = 1.0 if not is_apart else PLACE_TENSION if is_place else APART_TENSION
+            price += dual.tension[cell, k] * factor
     return price
 
 
@@ -521,8 +609,8 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
     for a in range(len(is_mixed)):
         if not is_mixed[a]:
             continue
-        excess, n_labels = _excess(dual, labels, a, -1, work) if is_near[a] else (0, 1)
-        if excess > 0:
+        fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 1)
+        if fault > 0.0:
             faces[count, 0], faces[count, 1], faces[count, 2] = a, -1, n_labels
             count += 1
         for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
@@ -531,8 +619,8 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
                 if b <= a or not is_mixed[b] or work.seen[b] == a or not (is_near[a] or is_near[b]):
                     continue
                 work.seen[b] = a
-                excess, n_labels = _excess(dual, labels, a, b, work)
-                if excess > 0:
+                fault, n_labels = _fault(dual, labels, a, b, work)
+                if fault > 0.0:
                     faces[count, 0], faces[count, 1], faces[count, 2] = a, b, n_labels
                     count += 1
     return count
@@ -575,6 +663,35 @@ def _excess(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[int
     return excess, n_labels
 
 
+@unit
+def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[float, int]:
+    """What is wrong at a node or an edge, in volumes of the cells around it: pinches, and false contact.
+
+    The number of labels there comes second; with false contact, which is no matter of manifolds, three or more.
+    """
+    excess, n_labels = _excess(dual, labels, a, b, work)
+    fault = (TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT) * excess
+    if n_labels > 1 and _has_false_contact(dual, labels, _gather(dual, a, b, work.star), work.star):
+        fault += APART_WEIGHT
+        n_labels = n_labels if excess > 0 else max(n_labels, 3)
+    return fault, n_labels
+
+
+@helper
+def _has_false_contact(dual: Dual, labels: NDArray, count: int, star: NDArray) -> bool:
+    """Whether labels of some cells meet that the voxels of all these cells keep apart."""
+    is_false = False
+    for i in range(1, count):
+        is_new = True
+        for j in range(i):
+            is_new = is_new and labels[star[j]] != labels[star[i]]
+        for j in range(i if is_new else 0):
+            is_false = is_false or dual.contacts.is_apart[labels[star[i]], labels[star[j]]]
+    for i in range(count if is_false else 0):
+        is_false = is_false and not dual.contacts.is_place[star[i]]
+    return is_false
+
+
 @helper
 def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, work: _Work) -> int:
     """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
@@ -613,7 +730,7 @@ def _mend(
     total, star, group = 0, np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
         a, b = faces[f, 0], faces[f, 1]
-        if _excess(dual, labels, a, b, work)[0] == 0:
+        if _fault(dual, labels, a, b, work)[0] == 0.0:
             continue
         count = _gather(dual, a, b, star)
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
@@ -735,8 +852,5 @@ def _pinches(dual: Dual, labels: Ints1, faces: Ints2, work: _Work) -> float:
     """What these nodes and edges cost that are not manifold."""
     total = 0.0
     for f in range(len(faces)):
-        excess, n_labels = _excess(dual, labels, faces[f, 0], faces[f, 1], work)
-        if excess > 0:
-            weight = TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT
-            total += weight * excess * dual.scale[faces[f, 0]]
+        total += _fault(dual, labels, faces[f, 0], faces[f, 1], work)[0] * dual.scale[faces[f, 0]]
     return total

@@ -38,6 +38,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
+from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import check_memory
@@ -173,6 +174,8 @@ def mesh_image(
     _check_names(options, optimize_paper if mode == "paper" else optimize)
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
+    if mode == "graded" and sizes is not None:
+        sizes = with_label_sizes(sizes, content, nodes, order)[0]
     if mode == "graded" and nodes is None and target_error is None and sizes is not None:
         nodes = values["nodes"] = _nodes_of(content, sizes, order)
     _check_mode(mode, content, values | {"sizes": sizes}, order)
@@ -263,6 +266,18 @@ def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
     if fraction < 1.0:
         return None
     return round(needed * (QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0))
+
+
+def with_label_sizes(
+    sizes: Sizes, content: Content, nodes: int | None, order: int
+) -> tuple[Sizes, SizesByLabel | None]:
+    """The sizes with targets by place for those by label, and what labels get if there are any.
+
+    `nodes` are those of the mesh, of order 2 with those in the middle of edges.
+    """
+    many = QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0
+    made = sizes_by_label(sizes, content, None if nodes is None else round(nodes / many))
+    return (sizes, None) if made is None else (made.sizes, made._replace(nodes=round(many * made.nodes)))
 
 
 def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int) -> None:

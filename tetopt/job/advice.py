@@ -12,11 +12,13 @@ from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
 from tetopt.engine.requirements import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
-from tetopt.job.events import violated, warning
+from tetopt.io.label_tables import LabelTable
+from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.model.labels import label_words
+from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
 LABEL_DICE = 0.5  # of a label with its cells: below it they hardly show the label
@@ -27,6 +29,7 @@ TARGETS_MISSED = 0.1  # of the edges: so many far over their target are said
 FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are not shown
 EULER_FRACTION = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
 EULER_USUAL = 8  # an Euler number of less counts as this: single holes come and go with the cells' size
+TOLD_BELOW_FRACTION = 0.02  # of a label's volume: less of it with fewer cells across than asked for is not said
 EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for the image
 THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
@@ -128,6 +131,20 @@ def warn_of_result(
             f"more than {MOST_MEETING} labels meet at {crowded} nodes, which are brought to where the first "
             f"{MOST_MEETING} of them do"
         )
+
+
+def tell_label_sizes(made: SizesByLabel, cells_across: float | None, table: LabelTable) -> None:
+    """Say how many nodes sizes by label take, and which labels stay below the cells asked for, the thinnest first."""
+    larger = "" if made.scale == 1.0 else f"; with fewer, edges are {made.scale:.2f} times as long"
+    note(f"sizes by label take about {made.nodes} nodes{larger}")
+    below = [each for each in made.layers if each.below >= TOLD_BELOW_FRACTION]
+    if below and cells_across is not None:
+        rows = [
+            f"{table.names.get(each.label, each.label)} in {each.below:.0%} of its volume (half of it under "
+            f"{each.thickness[1]:.3g} mm thick, {each.cells_across:.2g} cells across)"
+            for each in below
+        ]
+        note(f"fewer than {cells_across:g} cells across: {listed(rows)}")
 
 
 def warn_of_sizes(sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None) -> None:

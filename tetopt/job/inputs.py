@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -26,8 +27,9 @@ from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
+from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
-from tetopt.system.incoming import json_of
+from tetopt.system.incoming import json_of, text_of, toml_of
 
 IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 NAMES_LISTED = 8  # a line's worth
@@ -179,6 +181,31 @@ def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable
             warning(f"{path}: names none of the mesh's labels, {listed(np.unique(labels).tolist())}")
         return table
     return NO_TABLE if loaded is None else loaded.label_table
+
+
+def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
+    """Sizes by label, as an option or a file has them; names become numbers by a table of labels, if there is one."""
+    path = Path(text)
+    if path.suffix.lower() == ".toml":
+        text = ",".join(f"{name}={size}" for name, size in toml_of(path, "sizes").items())
+    elif path.suffix.lower() == ".csv":
+        text = ",".join("=".join(row[:2]) for row in csv.reader(text_of(path, "sizes").splitlines()) if row)
+    sizes = parse_label_sizes(text)
+    if table is None:
+        return sizes
+    numbers = {name: label for label, name in table.names.items()}
+    known = {name: size for name, size in sizes.items() if isinstance(name, int) or name in (*numbers, EVERY_LABEL)}
+    if unknown := [name for name in sizes if name not in known]:
+        raise InputError(
+            f'label_size: no label is called "{unknown[0]}"; {listed([*numbers]) or "the labels have no names"}'
+        )
+    by_label: dict[int | str, LabelSize] = {}
+    for name, size in known.items():
+        label = numbers.get(str(name), name)
+        if label in by_label:
+            raise InputError(f"label_size: label {label} has two sizes")
+        by_label[label] = size
+    return by_label
 
 
 def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:

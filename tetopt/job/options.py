@@ -166,6 +166,17 @@ class SizeOptions:
     gradation: Annotated[
         float | None, Option("G", "How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default).")
     ] = None
+    cells_across: Annotated[
+        float | None, Option("N", "Cells across each label where it is thin: edges of its local thickness / N.")
+    ] = None
+    label_size: Annotated[
+        str | None,
+        Option(
+            "LABEL=SIZE,...",
+            'Usual edge by label or name, mm, or a part of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6"; or '
+            "a file .toml or .csv of these.",
+        ),
+    ] = None
     sizing: Annotated[Path | None, Option("SIZES.nii.gz", "Usual edge by place, mm; 0 or less: as elsewhere.")] = None
 
 

@@ -11,16 +11,25 @@ import numpy as np
 from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
-from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
+from tetopt.engine.meshing import (
+    MODE_DEFAULTS,
+    QUADRATIC_NODES,
+    Mode,
+    check_target_error,
+    sizes_of_order,
+    with_label_sizes,
+)
 from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
 from tetopt.io.images import parse_crop, parse_slice
-from tetopt.job.inputs import balance_of, checked_outputs, number_of, read_companion
+from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
 from tetopt.parts.division import Division
 from tetopt.parts.work import VolumeFile
+from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
@@ -117,6 +126,7 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
         "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
         "lattice": kind_of(plan, ndim), "size_min": job.size_min, "edge_size": job.edge_size,
         "edge_max": job.edge_max, "gradation": job.gradation,
+        "cells_across": job.cells_across, "label_size": job.label_size,
         "sizing": None if job.sizing is None else job.sizing.name,
         **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
         "start": None if job.start is None else job.start.name, **plan.engine_options,
@@ -194,7 +204,7 @@ def _check_source(job: JobOptions) -> None:
     if job.keep_components and job.mask is None and job.background is None:
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
     if job.labels is None:
-        for name in ("label_names", "label_weight", "smooth_interfaces"):
+        for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
             if getattr(job, name) is not None:
                 raise InputError(f"`{name}`: there are no `labels`")
 
@@ -214,7 +224,9 @@ def _check_numbers(job: JobOptions) -> None:
         raise InputError(f"`spacing`: expected a length above 0 mm, got {job.spacing}")
     if job.target_error is not None:
         check_target_error(job.target_error)
-    _limits(changed(job, sizing=None))
+    _limits(changed(job, sizing=None, label_size=None))
+    if job.label_size is not None:
+        label_sizes_of(job.label_size)
 
 
 def _mode(job: JobOptions) -> Mode:
@@ -288,8 +300,10 @@ def _pictures(job: JobOptions) -> list[Path]:
     return list(checked_outputs(results_folder(job.figures), names, job.force).values())
 
 
-def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
-    """The plan with the defaults that depend on the image, and the sizes.
+def with_numbers(
+    plan: Plan, content: Content, table: LabelTable = NO_TABLE
+) -> tuple[Plan, Sizes | None, SizesByLabel | None]:
+    """The plan with the defaults that depend on the image, the sizes, and what labels get of them; `table` names these.
 
     These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
     anyway and is stated.
@@ -297,11 +311,13 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
     image, job = content.image, plan.job
     is_counted = job.nodes is not None or job.target_error is not None or job.spacing is not None
     if plan.mode == "start":
-        return plan, None
+        return plan, None, None
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
-        return plan._replace(job=changed(job, nodes=nodes)), None
-    order, nodes, limits = plan.order, job.nodes, _limits(job)
+        return plan._replace(job=changed(job, nodes=nodes)), None, None
+    order, nodes, limits, by_label = plan.order, job.nodes, _limits(job, table), None
+    if limits is not None:
+        limits, by_label = with_label_sizes(limits, content, nodes, order)
     if not is_counted:
         nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
     limits = sizes_of_order(content, nodes, limits, order)
@@ -309,7 +325,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, Sizes | None]:
     if longest is None and nodes is not None:
         longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
         longest = longest if longest < np.inf else None
-    return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits
+    return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits, by_label
 
 
 def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
@@ -326,12 +342,13 @@ def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
     return int(np.rint(many * corners))
 
 
-def _limits(job: JobOptions) -> Sizes | None:
+def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
     """The limits on sizes, if the options ask for any."""
+    by_label = None if job.label_size is None else label_sizes_of(job.label_size, table)
     field = None if job.sizing is None else read_companion(job.sizing)
     values = {
         "smallest": job.size_min, "edge_size": job.edge_size, "gradation": job.gradation, "field": field,
-        "longest": job.edge_max,
+        "longest": job.edge_max, "cells_across": job.cells_across, "by_label": by_label,
     }  # fmt: skip
     limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     return Sizes(**limits) if limits else None

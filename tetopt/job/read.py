@@ -9,6 +9,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
+from tetopt.job.advice import tell_label_sizes
 from tetopt.job.events import started, warning
 from tetopt.job.in_parts import left_source, with_parts
 from tetopt.job.inputs import label_table, read_mesh, set_threads
@@ -70,7 +71,9 @@ def read_planned(plan: Plan) -> Task:
             plan = plan._replace(job=changed(plan.job, order=2))
         if source.labels is not None and not source.table.names:
             source = source.with_table(label_table(None, begun))
-    plan, sizes = with_numbers(plan, source.content)
+    plan, sizes, by_label = with_numbers(plan, source.content, source.table)
+    if by_label is not None:
+        tell_label_sizes(by_label, plan.job.cells_across, source.table)
     n_started = None if begun is None else len(begun.mesh.points)
     size = size_of_run(plan, source.content, source.contrasts[0], n_started)
     # With the checksums of the files as they are now.

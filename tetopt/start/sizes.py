@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -70,6 +71,12 @@ class Sizes(NamedTuple):
         edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
         better, but the displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of
         blocks on the box's faces.
+    cells_across : float, optional
+        So many cells lie across a label where it is thin: the target is its local thickness by as much
+        (`sizes_by_label`), not below `smallest` or a voxel.
+    by_label : mapping of int to float, str or LabelSize, optional
+        Targets by label, "*" for all others: mm, or a part of the local thickness t, "0.6t", or "0.6t[1:10]" between
+        bounds in mm.
 
     Raises
     ------
@@ -90,6 +97,8 @@ class Sizes(NamedTuple):
     field: Image | None = None
     coarsest: float | None = None
     longest: float | None = None
+    cells_across: float | None = None
+    by_label: Mapping[int | str, Any] | None = None
 
     @property
     def slope(self) -> float:
@@ -137,6 +146,8 @@ class Sizes(NamedTuple):
                 raise InputError(f"{name}: {value:g} mm is below the smallest size, {self.smallest:g} mm")
         if not 0.05 <= self.slope <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
+        if self.cells_across is not None or self.by_label:
+            raise InputError("sizes: cells_across and by_label are settled by `sizes_by_label`, with the labels; do so")
         if self.field is not None and self.field.ndim != n:
             raise InputError(f"field: expected one in {n}-D, as the image is, got a {self.field.ndim}-D one")
         if self.field is not None and not (self.field.data > 0.0).any():

@@ -1,0 +1,131 @@
+"""Thin labels in meshes: sampled cells, volumes kept by a bias, sheets that are not torn."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_array
+from test_labelling import across_of, lattice
+
+import tetopt
+from tetopt.contents.memberships import labels_at, memberships
+from tetopt.engine.interfaces import SAMPLES, cell_contents
+from tetopt.engine.labelling import balanced, contacts_of, labelled
+from tetopt.geometry.simplex import volumes
+from tetopt.measure.interfaces import label_interfaces
+
+NO_COMPONENTS = [np.array([10**6] * 50)] * 3
+
+
+def shell_image(size, thickness, radius):
+    r = np.linalg.norm(np.indices((size,) * 3) - 0.5 * (size - 1) + 0.13, axis=0)
+    return tetopt.Image(1.0 + (r >= radius) + (r >= radius + thickness))
+
+
+def contact(mesh, of_cell, a, b):
+    """Area of the facets between cells of two labels."""
+    across = across_of(mesh.cells, len(mesh.points))
+    cell, k = np.nonzero((across >= 0) & (of_cell[:, None] == a) & (of_cell[across] == b))
+    other = np.array([np.delete(mesh.cells[c], j) for c, j in zip(cell, k, strict=True)], dtype=int).reshape(-1, 3)
+    x = mesh.points[other]
+    return 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1).sum()
+
+
+def test_a_place_has_the_label_of_its_smallest_level():
+    """As by interpolation of every label's level; at voxels' centres the partition itself."""
+    rng = np.random.default_rng(4)
+    members = memberships(tetopt.Image(rng.integers(0, 3, (7, 6, 8)).astype(float)))
+    index = rng.uniform(0.0, 1.0, (500, 3)) * (np.array([7, 6, 8]) - 1)
+    centres = np.argwhere(members.partition >= 0)
+    assert np.array_equal(labels_at(members, centres.astype(float)), members.partition.ravel())
+    levels = np.array([map_coordinates(members.levels[c], index.T, order=1) for c in members.channel])
+    expected = levels.argmin(axis=0)
+    # A label is looked for among those of the voxels around; by levels alone another one may be as near.
+    is_near = np.array(
+        [
+            row in members.partition[tuple(slice(int(i), int(i) + 2) for i in at)]
+            for row, at in zip(expected, index, strict=True)
+        ]
+    )
+    assert is_near.mean() > 0.95
+    assert np.mean(labels_at(members, index)[is_near] == expected[is_near]) > 0.995  # but ties
+
+
+def test_small_cells_are_filled_by_levels_not_by_centres():
+    """A plane that cuts small cells: what they hold of each side is the plane's, not one voxel's."""
+    image = tetopt.Image((np.indices((8, 8, 8))[0] >= 4).astype(float) + 1.0)
+    mesh = tetopt.lattice_mesh(image, spacing=1.6)
+    members = memberships(image)
+    counts, _ = cell_contents(image, members, mesh)
+    size = volumes(mesh.points, mesh.cells)
+    assert counts.sum(axis=1) == pytest.approx(size)
+    places = SAMPLES[3] @ mesh.points[mesh.cells]
+    above = (places[:, :, 0] > 3.5).mean(axis=1)  # index -0.5 is the side of the box
+    assert counts.toarray()[:, 1] == pytest.approx(above * size)
+    assert ((above > 0.0) & (above < 1.0)).any()
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_thin_label_keeps_its_volume(n):
+    """A label that fills a third of the cells of a slab gets a third of these, or none without a bias."""
+    points, cells = lattice(n, 4)
+    size, across = volumes(points, cells), across_of(cells, len(points))
+    middle = points[cells].mean(axis=1)
+    is_slab = np.abs(middle[:, 0] - middle[:, 0].mean()) < 1.0
+    share = np.where(is_slab, 0.34 + 0.02 * np.sin(7.0 * middle[:, -1]), 0.0)
+    counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
+    kept = labelled(points, cells, across, counts, NO_COMPONENTS[:2], weight=1e-3)
+    lost = labelled(points, cells, across, counts, NO_COMPONENTS[:2], bias=np.zeros(2), weight=1e-3)
+    aim = (share * size).sum()
+    assert size[kept.labels == 1].sum() == pytest.approx(aim, rel=0.35)
+    assert (lost.labels == 1).sum() <= 1
+    assert kept.bias[1] > 0.1 > kept.bias[0]
+
+
+def test_a_bias_rises_for_what_is_missing():
+    bias = balanced(np.zeros(3), np.array([10.0, 10.0, 0.0]), np.array([9.9, 12.0, 0.0]))
+    assert bias == pytest.approx([20.0 * 0.01**2, -0.15, 0.0])
+
+
+def test_pairs_that_do_not_touch():
+    """Two labels beside a third, and one place where they touch."""
+    partition = np.zeros((8, 6, 6), dtype=np.int64)
+    partition[3:5], partition[5:] = 1, 2
+    owner = np.arange(partition.size).reshape(partition.shape)
+    contacts = contacts_of(partition, np.ones(3), 3, owner, partition.size)
+    assert contacts.is_apart.tolist() == [[False, False, True], [False, False, False], [True, False, False]]
+    assert not contacts.is_place.any()
+    partition[3:5, 2, 2] = 2
+    contacts = contacts_of(partition, np.ones(3), 3, owner, partition.size)
+    assert contacts.is_apart[0, 2]
+    assert sorted(np.flatnonzero(contacts.is_place)) == sorted([owner[2, 2, 2], owner[3, 2, 2]])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("thickness", "percent"), [(3.0, 2.0), (1.5, 8.0)])
+def test_a_shell_of_one_cell_is_whole(thickness, percent):
+    """Volume, one component, no hole, and hardly any contact of what lies within and without."""
+    image = shell_image(36, thickness, 10.0)
+    result = tetopt.mesh_image(
+        tetopt.content(image, image, weights=[0.0]), sizes=tetopt.Sizes(edge_size=8.0, cells_across=1)
+    )
+    volume = 4.0 / 3.0 * np.pi * ((10.0 + thickness) ** 3 - 10.0**3)
+    size = volumes(result.mesh.points, result.mesh.cells)
+    assert size[result.labels == 2].sum() == pytest.approx(volume, rel=0.01 * percent)
+    rows = label_interfaces(image, result.mesh, result.labels)
+    assert [row.mesh_euler for row in rows] == [2, 4, 4]  # two spheres around the shell: no hole
+    assert contact(result.mesh, result.labels, 1, 3) < 1e-3 * rows[1].area
+    assert dict(result.violated) == {}
+
+
+@pytest.mark.full
+def test_without_volumes_kept_a_thin_label_goes():
+    image = shell_image(36, 1.5, 10.0)
+    content, free = (tetopt.content(image, image, weights=[0.0], keep_volumes=keeps) for keeps in (True, False))
+    sizes, made = [], []
+    for each in (content, free):
+        result = tetopt.mesh_image(each, 400, iterations=8)
+        size = volumes(result.mesh.points, result.mesh.cells)
+        sizes.append(size[result.labels == 2].sum())
+        made.append(result)
+    aim = (image.data == 2).sum()
+    assert abs(sizes[0] / aim - 1.0) < abs(sizes[1] / aim - 1.0)

@@ -1,0 +1,307 @@
+"""Sizes of cells by label: so many cells across where a label is thin, or a length, or a part of its thickness.
+
+Targets of `tetopt.start.sizes` by place, from the local thickness of labels (`tetopt.contents.thickness`), as of
+proximity sizing in Ansys, of narrow regions in COMSOL, and of the slopes of SimNIBS' charm (Puonti et al. 2020,
+NeuroImage 219, 117044).
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.contents.content import Content, plain
+from tetopt.contents.thickness import local_thickness
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.start.octree import nodes_of_sizes
+from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Sizes
+
+EVERY_LABEL = "*"  # all labels that have no size of their own
+SIZE_FORM = re.compile(r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?")
+DEFAULT_SIZED_NODES = 5000  # of the uniform mesh whose edges are the largest where neither nodes nor lengths are given
+THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)
+BELOW_FRACTION = 0.98  # of the cells asked for: where fewer lie across, a place counts as below
+SCALE_STEPS = 12  # of bisection for the factor by which a number of nodes makes sizes larger: to a thousandth
+LARGEST_SCALE = 64.0  # of that factor
+MOST_ACROSS = 20.0  # cells across a label
+
+
+class LabelSize(NamedTuple):
+    """The size of a label's cells, mm: a length, or a multiple of the local thickness between bounds.
+
+    Parameters
+    ----------
+    length : float
+        mm; with `is_slope` mm by mm of thickness.
+    is_slope : bool
+        Whether the thickness counts.
+    least, most : float
+        Bounds of the size, mm.
+
+    Examples
+    --------
+    >>> LabelSize(0.5, is_slope=True, least=1.0).at(np.array([1.0, 4.0]))
+    array([1., 2.])
+    """
+
+    length: float
+    is_slope: bool = False
+    least: float = 0.0
+    most: float = np.inf
+
+    def at(self, thickness: NDArray) -> NDArray[np.float64]:
+        """The size, mm, where a label is so thick, mm; of the same shape."""
+        size = self.length * thickness if self.is_slope else np.full(np.shape(thickness), self.length)
+        return np.asarray(np.clip(size, self.least, self.most), dtype=np.float64)
+
+
+class LabelLayers(NamedTuple):
+    """How thick a label is, and what sizes of cells it gets.
+
+    Parameters
+    ----------
+    label : int
+        Its number.
+    thickness : tuple of float
+        5, 50 and 95 % of its voxels are no thicker, mm; what is thicker than sizes depend on counts as so thick.
+    edge : float
+        The median of its targets, mm.
+    cells_across : float
+        The median of thickness over target.
+    below : float
+        The fraction of its voxels across which there are fewer cells than asked for; 0 if no number is.
+    """
+
+    label: int
+    thickness: tuple[float, float, float]
+    edge: float
+    cells_across: float
+    below: float
+
+
+class SizesByLabel(NamedTuple):
+    """What `sizes_by_label` returns.
+
+    Parameters
+    ----------
+    sizes : Sizes
+        With a field of targets.
+    nodes : int
+        How many nodes the sizes that were asked for take, about.
+    scale : float
+        By how much they are larger than asked for, as fewer nodes are to be had; 1 if they are not.
+    layers : list of LabelLayers
+        A row for each label, the thinnest first.
+    """
+
+    sizes: Sizes
+    nodes: int
+    scale: float
+    layers: list[LabelLayers]
+
+
+def parse_label_sizes(text: str) -> dict[int | str, LabelSize]:
+    """Sizes by label, or by labels' names, as written on a command line, `*` for all others.
+
+    Parameters
+    ----------
+    text : str
+        "NAME=SIZE, ...", a size being mm, or a part of the thickness t, with bounds in mm if need be.
+
+    Returns
+    -------
+    dict of int or str to LabelSize
+        In that order.
+
+    Raises
+    ------
+    InputError
+        The text is something else, or names a label twice.
+
+    Examples
+    --------
+    >>> sizes = parse_label_sizes("fluid=1.5, 4=0.6t[1:10], *=6")
+    >>> sizes["fluid"].length, sizes[4].is_slope, sizes[4].most
+    (1.5, True, 10.0)
+    """
+    sizes: dict[int | str, LabelSize] = {}
+    for pair in text.split(","):
+        name, equals, size = (part.strip() for part in pair.partition("="))
+        if not (name and equals):
+            raise InputError(f'label_size: expected "LABEL=SIZE, ...", got "{text}"')
+        label = int(name) if name.isdecimal() else name
+        if label in sizes:
+            raise InputError(f"label_size: {name} has two sizes")
+        sizes[label] = parse_label_size(size)
+    return sizes
+
+
+def parse_label_size(text: str | float) -> LabelSize:
+    """The size that a text says: "1.5", "0.6t", "0.6t[1:10]", or a number.
+
+    Raises
+    ------
+    InputError
+        It says none, or one that is not above 0.
+    """
+    match = SIZE_FORM.fullmatch(str(text).replace(" ", ""))
+    try:
+        if match is None:
+            raise ValueError(text)
+        size = LabelSize(
+            float(match["length"]), bool(match["t"]), float(match["least"] or 0.0), float(match["most"] or np.inf)
+        )
+    except ValueError:
+        raise InputError(
+            f'label_size: expected mm, or a part of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
+        ) from None
+    if not (0.0 < size.length < np.inf and 0.0 <= size.least <= size.most and size.most > 0.0):
+        raise InputError(f'label_size: expected lengths above 0 mm, the bounds rising, got "{text}"')
+    return size
+
+
+def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = None) -> SizesByLabel | None:
+    """Targets by place from `cells_across` and `by_label` of sizes; None without them.
+
+    A place gets the smallest of: its label's size; its local thickness over `cells_across`; `field` and `edge_size`. It
+    is never below `smallest`. Without `edge_size`, places that are not thin get no target if `nodes` are given, and the
+    usual edge of a uniform mesh of 5,000 nodes else.
+
+    Parameters
+    ----------
+    sizes : Sizes
+        What is asked for.
+    image : Image or Content
+        With labels.
+    nodes : int, optional
+        How many nodes, corners of cells, there are: if sizes take more, all become larger by one factor.
+
+    Returns
+    -------
+    SizesByLabel
+        The sizes with a field for them, and what each label gets.
+
+    Raises
+    ------
+    InputError
+        No labels, none of a number that has a size, a value out of range.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("layers")
+    >>> content = tetopt.content(phantom.image(voxel_mm=2), phantom.label_image(voxel_mm=2))
+    >>> made = tetopt.sizes_by_label(tetopt.Sizes(edge_size=10.0, cells_across=2), content)
+    >>> made.layers[0].cells_across >= 1.9
+    True
+    """
+    if sizes.cells_across is None and not sizes.by_label:
+        return None
+    content = plain(image)
+    rules = _rules(sizes, content)
+    largest, is_everywhere = _largest(sizes, content, nodes)
+    voxel = content.image.voxel_volume ** (1.0 / content.image.ndim)
+    smallest = max(sizes.smallest, voxel)
+    thickness = _thickness(sizes, content, rules, largest)
+    wanted_target = _targets(sizes, content, rules, thickness, largest)
+    bare = sizes._replace(cells_across=None, by_label=None, field=None, edge_size=largest)
+
+    def scaled(scale: float) -> Sizes:
+        larger = np.clip(scale * wanted_target, smallest, max(largest, smallest)).astype(np.float32)
+        if content.inside is not None:
+            larger[~content.inside] = 0.0
+        return bare._replace(field=Image(larger, content.image.affine))
+
+    needed, scale = nodes_of_sizes(content, scaled(1.0))[0], 1.0
+    if nodes is not None and needed > nodes:
+        low, high = 1.0, LARGEST_SCALE
+        for _ in range(SCALE_STEPS):
+            scale = float(np.sqrt(low * high))
+            low, high = (low, scale) if nodes_of_sizes(content, scaled(scale))[0] <= nodes else (scale, high)
+        scale = high
+    made = scaled(scale)
+    assert made.field is not None
+    layers = _layers(sizes, content, thickness, made.field.data)
+    if not is_everywhere:
+        data = np.where(made.field.data < largest, made.field.data, 0.0)
+        made = made._replace(edge_size=None, field=Image(data, content.image.affine) if data.any() else None)
+    return SizesByLabel(made, needed, scale, layers)
+
+
+def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
+    """The size of each label that has one, by its row; InputError for labels that there are not, and wrong values."""
+    members = content.memberships
+    if members is None:
+        raise InputError("sizes: cells_across and by_label take labels whose interfaces are smooth; give labels")
+    if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
+        raise InputError(f"cells_across: expected above 0 to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
+    by_label = {
+        label: size if isinstance(size, LabelSize) else parse_label_size(size)
+        for label, size in (sizes.by_label or {}).items()
+    }
+    rest = by_label.pop(EVERY_LABEL, None)
+    rows = {int(label): row for row, label in enumerate(members.labels)}
+    if missing := [label for label in by_label if label not in rows]:
+        names = ", ".join(map(str, rows))
+        raise InputError(f"label_size: no voxel that is meshed has label {missing[0]}; there are {names}")
+    rules = {rows[int(label)]: size for label, size in by_label.items()}
+    return rules if rest is None else {row: rules.get(row, rest) for row in rows.values()}
+
+
+def _largest(sizes: Sizes, content: Content, nodes: int | None) -> tuple[float, bool]:
+    """The largest target, mm, and whether there is one everywhere."""
+    if sizes.edge_size is not None and sizes.edge_size < np.inf:
+        return sizes.edge_size, True
+    n = content.image.ndim
+    longest = sizes.longest_edge(content.image, nodes or DEFAULT_SIZED_NODES, content.volume)
+    return min(longest * USUAL_IN_BLOCK[n] / LONGEST_IN_BLOCK[n], NO_BOUND_MM), nodes is None
+
+
+def _thickness(
+    sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float
+) -> NDArray[np.float32]:  # fmt: skip
+    """The local thickness by voxel, mm, up to where sizes depend on it no more."""
+    assert content.memberships is not None
+    spacing = content.image.spacing
+    slopes = [min(rule.most, largest) / rule.length for rule in rules.values() if rule.is_slope]
+    most = max([largest * (sizes.cells_across or 0.0), *slopes, float(spacing.min())])
+    longest_side = float(np.linalg.norm(spacing * content.image.shape))
+    return local_thickness(content.memberships, spacing, min(most, longest_side), content.inside)
+
+
+def _targets(
+    sizes: Sizes, content: Content, rules: dict[int, LabelSize], thickness: NDArray[np.float32], largest: float
+) -> NDArray[np.float64]:
+    """The smallest target of those asked for at each voxel, mm."""
+    assert content.memberships is not None
+    target = np.minimum(sizes.on_voxels(content.image), largest).astype(np.float64)
+    if sizes.cells_across is not None:
+        target = np.minimum(target, thickness / sizes.cells_across)
+    for row, rule in rules.items():
+        is_label = content.memberships.partition == row
+        target[is_label] = np.minimum(target[is_label], rule.at(thickness[is_label]))
+    return target
+
+
+def _layers(
+    sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray
+) -> list[LabelLayers]:  # fmt: skip
+    """What each label gets, the thinnest first."""
+    assert content.memberships is not None
+    rows = []
+    for row, label in enumerate(content.memberships.labels):
+        is_label = content.memberships.partition == row
+        if content.inside is not None:
+            is_label &= content.inside
+        if not is_label.any():
+            continue
+        thick, edge = thickness[is_label], target[is_label]
+        low, middle, high = np.percentile(thick, THICKNESS_PERCENTILES)
+        across = thick / edge
+        below = 0.0 if sizes.cells_across is None else float((across < BELOW_FRACTION * sizes.cells_across).mean())
+        numbers = float(low), float(middle), float(high)
+        rows.append(LabelLayers(int(label), numbers, float(np.median(edge)), float(np.median(across)), below))
+    return sorted(rows, key=lambda each: each.thickness)
