@@ -58,6 +58,7 @@ from .model.mappings import ByLabel as ByLabel
 from .model.loads import Load as Load
 from .model.materials import BinningError as BinningError, Materials as Materials
 from .model.model import Model as Model
+from .model.tissues import Merged as Merged, merge_labels as merge_labels
 from .model.sets import Box as Box, Sets as Sets
 from .contents.phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
 from .start.lattice import lattice_mesh as lattice_mesh

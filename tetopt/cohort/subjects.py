@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
+from tetopt.model.tissues import FILES_IN_TEXTS
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
 
@@ -212,9 +212,9 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
 
 
 def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
-    """The files that mappings among a subject's options name."""
-    for name in MAPPED_OPTIONS:
-        if (file := mapping_file(options.get(name, ""))) is not None:
+    """The files that the texts of a subject's options name."""
+    for name, file_of in FILES_IN_TEXTS.items():
+        if (file := file_of(options.get(name, ""))) is not None:
             yield name, file
 
 

@@ -19,6 +19,7 @@ from tetopt.io.images import parse_crop, parse_slice
 from tetopt.job.inputs import balance_of, checked_outputs, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
+from tetopt.model.tissues import groups_of, merge_file
 from tetopt.parts.division import Division
 from tetopt.parts.work import VolumeFile
 from tetopt.start.lattice import KINDS
@@ -194,9 +195,11 @@ def _check_source(job: JobOptions) -> None:
     if job.keep_components and job.mask is None and job.background is None:
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
     if job.labels is None:
-        for name in ("label_names", "label_weight", "smooth_interfaces"):
+        for name in ("merge", "label_names", "label_weight", "smooth_interfaces"):
             if getattr(job, name) is not None:
                 raise InputError(f"`{name}`: there are no `labels`")
+    if job.merge is not None and merge_file(job.merge) is None:
+        groups_of(job.merge)
 
 
 def _check_numbers(job: JobOptions) -> None:

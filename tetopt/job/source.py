@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,17 +13,19 @@ from numpy.typing import NDArray
 from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 from tetopt.contents.content import Content, content, continued
 from tetopt.energy.sampling import cell_moments
+from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.job.events import note
-from tetopt.job.inputs import balance_of, image_and_others, label_table, number_of
+from tetopt.job.events import note, warning
+from tetopt.job.inputs import balance_of, image_and_others, label_table, listed, number_of
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
-from tetopt.model.labels import TABLE_TEXT, table_words
+from tetopt.model.labels import TABLE_TEXT, label_words, table_of_labels, table_words
 from tetopt.model.sets import box_of, box_text
+from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
 
 
 class Source(NamedTuple):
@@ -96,13 +100,22 @@ class Source(NamedTuple):
         return rows
 
 
-def read_source(options: SourceOptions, label_names: Path | None = None) -> Source:
-    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image."""
+def read_source(
+    options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None
+) -> Source:  # fmt: skip
+    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image.
+
+    Labels get other `numbers`, if they are given, and are merged otherwise as the options and their names say.
+    """
     paths = options.images
     table = label_table(label_names)
     image, beside = image_and_others(paths[0], options)
-    contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     labels = None if options.labels is None else beside(options.labels, resample_labels)
+    is_own = labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data)
+    if labels is not None:
+        labels, table, numbers = _merged(labels, table, options, numbers)
+        image = labels if is_own and numbers else image
+    contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     mask = None if options.mask is None else beside(options.mask, resample_mask)
     level = None
     if options.background is not None:
@@ -113,7 +126,7 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
     balance = balance_of(options)
-    if options.weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
+    if options.weights is None and is_own:
         note("the image is its own labels: only these count")
         balance = balance._replace(weights=[0.0])
     represented = content(contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components)
@@ -123,6 +136,7 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
+        **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
@@ -134,6 +148,33 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+def _merged(
+    labels: Image, table: LabelTable, options: SourceOptions, numbers: Mapping[int, int] | None
+) -> tuple[Image, LabelTable, Mapping[int, int]]:  # fmt: skip
+    """The labels merged as the options, or names that they share, say; their table; and which have which new number."""
+    if numbers is not None:
+        return renumbered(labels, numbers), table, numbers
+    if options.merge is not None:
+        try:
+            merged = merge_labels(labels, options.merge, table.names)
+        except InputError as error:
+            raise InputError(f"{options.labels}: {error}") from error
+        missing = [name for label, name in merged.names.items() if label not in merged.numbers.values()]
+        if missing and not is_preset(options.merge):
+            warning(f"`merge`: {options.labels} has no label of {listed(missing)}")
+        sizes = sorted(Counter(merged.numbers.values()).items())
+        note(f"labels merged: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
+        return merged.labels, LabelTable(merged.names, {}), merged.numbers
+    present = np.unique(labels.data)
+    numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}
+    if not numbers:
+        return labels, table, numbers
+    words = [f"{old} into {label_words(new, table.names)}" for old, new in sorted(numbers.items())]
+    note(f"labels merged, as they share a name: {listed(words)}")
+    left = set(table.names) - set(numbers_by_name(table.names))
+    return renumbered(labels, numbers), table_of_labels(table, left), numbers
 
 
 def whose_variance(content: Content) -> str:
