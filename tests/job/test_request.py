@@ -26,6 +26,7 @@ VALUES = {
     "density": "1000", "average": "hill", "bins": "5:log", "sets": ["A=below:1", "B=below:2"], "written_sets": "all",
     "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
     "space": "lps", "keep_components": True, "merge": "white=2,41; rest=*",
+    "tissues": Path("/c1.nii,/c2.nii"),
 }  # fmt: skip
 
 

@@ -58,6 +58,7 @@ class Judgement(NamedTuple):
             return []
         inputs, there = table_in(self.loaded, "inputs"), {"mask": self.source.mask, "labels": self.source.labels}
         left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
+        left_out += ["tissues"] * (self.source.labels is None and inputs.get("tissues") is not None)
         images = inputs.get("images")
         return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
 

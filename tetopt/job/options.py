@@ -109,6 +109,10 @@ class RegionOptions:
         False
     )
     labels: Annotated[Path | None, Option("LABELS", "Label image: each cell is to be of one label.")] = None
+    tissues: Annotated[
+        Path | None,
+        Option("FILE,...", "Tissue probabilities instead of labels: a file each, or one in 4-D; 0 is what they leave."),
+    ] = None
     merge: Annotated[
         str | None,
         Option(

@@ -177,7 +177,7 @@ def resolved(job: JobOptions) -> Plan:
                 f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
             )
     completed = _completed(job, mode)
-    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels)
+    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
         raise InputError("`method` paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
     return Plan(mode, completed, job)
@@ -194,8 +194,12 @@ def _check_source(job: JobOptions) -> None:
         raise InputError("`mask` and `background`: give one of them")
     if job.keep_components and job.mask is None and job.background is None:
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
-    if job.labels is None:
-        for name in ("merge", "label_names", "label_weight", "smooth_interfaces"):
+    if job.labels is not None and job.tissues is not None:
+        raise InputError("`labels` and `tissues`: give one of them")
+    if job.merge is not None and job.labels is None:
+        raise InputError("`merge`: there are no `labels`")
+    if job.labels is None and job.tissues is None:
+        for name in ("label_names", "label_weight", "smooth_interfaces"):
             if getattr(job, name) is not None:
                 raise InputError(f"`{name}`: there are no `labels`")
     if job.merge is not None and merge_file(job.merge) is None:
@@ -286,7 +290,7 @@ def _pictures(job: JobOptions) -> list[Path]:
         return []
     names = ["slice.png", "rho.png", "energies.png"]
     names += [] if job.mask is None and job.background is None else ["boundary.png"]
-    names += [] if job.labels is None else ["labels.png"]
+    names += [] if job.labels is None and job.tissues is None else ["labels.png"]
     names += ["thumbnail.png"]
     return list(checked_outputs(results_folder(job.figures), names, job.force).values())
 

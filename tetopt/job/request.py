@@ -12,7 +12,7 @@ from typing import Any
 import tetopt
 from tetopt.io.images import sha256
 from tetopt.io.stored_images import stored_checksum
-from tetopt.job.inputs import file_and_volume
+from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
 from tetopt.model.tissues import FILES_IN_TEXTS
 
@@ -56,6 +56,8 @@ def _files(name: str, value: Any) -> list[Path]:
     """The files among an option's values."""
     if name in FILES_IN_TEXTS:
         return [] if (file := FILES_IN_TEXTS[name](value)) is None else [file]
+    if name == "tissues":
+        return tissue_files(value)
     return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]
 
 

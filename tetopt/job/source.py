@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,12 +12,22 @@ from numpy.typing import NDArray
 
 from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 from tetopt.contents.content import Content, content, continued
+from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note, warning
-from tetopt.job.inputs import balance_of, image_and_others, label_table, listed, number_of
+from tetopt.job.inputs import (
+    balance_of,
+    file_and_volume,
+    image_and_others,
+    label_table,
+    listed,
+    number_of,
+    tissue_files,
+    tissue_volumes,
+)
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
@@ -108,13 +118,10 @@ def read_source(
     Labels get other `numbers`, if they are given, and are merged otherwise as the options and their names say.
     """
     paths = options.images
-    table = label_table(label_names)
     image, beside = image_and_others(paths[0], options)
-    labels = None if options.labels is None else beside(options.labels, resample_labels)
-    is_own = labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data)
-    if labels is not None:
-        labels, table, numbers = _merged(labels, table, options, numbers)
-        image = labels if is_own and numbers else image
+    labels, table, numbers, tissues, is_own = _labelling(options, image, beside, label_names, numbers)
+    if labels is not None and is_own and numbers:
+        image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     mask = None if options.mask is None else beside(options.mask, resample_mask)
     level = None
@@ -127,14 +134,19 @@ def read_source(
         )
     balance = balance_of(options)
     if options.weights is None and is_own:
-        note("the image is its own labels: only these count")
+        note(f"the image is {'its own labels' if tissues is None else 'one of the tissues'}: only these count")
         balance = balance._replace(weights=[0.0])
-    represented = content(contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components)
-    files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
+    represented = content(
+        contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
+        keep_components=options.keep_components,
+    )  # fmt: skip
+    of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
+    files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
     inputs = {
         "images": [path.name for path in paths], "weights": balance.weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
+        **({} if tissues is None else {"tissues": [path.name for path in of_tissues]}),
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
@@ -148,6 +160,36 @@ def read_source(
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+class ReadLabels(NamedTuple):
+    """Labels of the image's voxels, as they were read."""
+
+    labels: Image | None = None
+    table: LabelTable = NO_TABLE
+    numbers: Mapping[int, int] = {}
+    tissues: list[Image] | None = None  # probabilities, which the labels are the largest of
+    is_own: bool = False  # whether the image is nothing else
+
+
+def _labelling(
+    options: SourceOptions, image: Image, beside: Callable[..., Image], label_names: Path | None,
+    numbers: Mapping[int, int] | None,
+) -> ReadLabels:  # fmt: skip
+    """Labels, merged as is asked for, or tissues, beside the image."""
+    table, is_alone = label_table(label_names), len(options.images) == 1
+    if options.tissues is not None:
+        volumes = tissue_volumes(options.tissues)
+        tissues = [beside(path, resample_tissue) for path in volumes.values()]
+        if not table.names:
+            table = LabelTable(dict(enumerate(volumes, 1)), table.colours)
+        is_own = is_alone and options.images[0] in tissue_files(options.tissues)
+        return ReadLabels(tissue_labels(tissues), table, {}, tissues, is_own)
+    if options.labels is None:
+        return ReadLabels(table=table)
+    labels = beside(options.labels, resample_labels)
+    is_own = is_alone and np.array_equal(labels.data, image.data)
+    return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
 
 
 def _merged(
