@@ -9,6 +9,7 @@ from .contents.align import (
     resample_mask as resample_mask,
 )
 from .contents.content import Content as Content, content as content
+from .contents.probabilities import resample_tissue as resample_tissue, tissue_labels as tissue_labels
 from .contents.statistics import Statistics as Statistics
 from .energy.discretization import E_D as E_D
 from .energy.geometric import E_G as E_G
@@ -58,6 +59,7 @@ from .model.mappings import ByLabel as ByLabel
 from .model.loads import Load as Load
 from .model.materials import BinningError as BinningError, Materials as Materials
 from .model.model import Model as Model
+from .model.tissues import Merged as Merged, merge_labels as merge_labels
 from .model.sets import Box as Box, Sets as Sets
 from .contents.phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
 from .start.label_sizes import (

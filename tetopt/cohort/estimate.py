@@ -38,7 +38,7 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
     estimate = {}
     for entry in entries:
         job = entry.job
-        files = len(job.images), job.mask is None, job.labels is None
+        files = len(job.images), job.mask is None, job.labels is None, job.tissues is None
         kind = (*files, job.background, *(getattr(job, field.name) for field in fields(SizeOptions)))
         known = like.setdefault(kind, {})
         try:

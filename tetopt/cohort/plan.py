@@ -6,22 +6,33 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState, foreign_files, state_of
-from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
+from tetopt.cohort.subjects import (
+    FILE_OPTIONS,
+    Problems,
+    Subject,
+    doubled,
+    key,
+    label_of,
+    matching,
+    of_each,
+    read_table,
+)
 from tetopt.errors import InputError
 from tetopt.io.formats import BUILT_IN
 from tetopt.job.events import note
-from tetopt.job.inputs import file_and_volume
+from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.job.texts import option_words, with_options
-from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
+from tetopt.model.tissues import FILES_IN_TEXTS
 
 
 class PlannedSubject(NamedTuple):
@@ -119,7 +130,7 @@ class _Plans:
     """Plans of subjects; options that several share are checked once."""
 
     def __init__(self, options: RunOptions, suffix: str) -> None:
-        mappings = {name: mapping_file(getattr(options, name) or "") for name in MAPPED_OPTIONS}
+        mappings = {name: file_of(getattr(options, name) or "") for name, file_of in FILES_IN_TEXTS.items()}
         # A worker may be started in another folder.
         placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
         self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")
@@ -129,7 +140,7 @@ class _Plans:
     def of(self, subject: Subject) -> tuple[RunOptions, Plan]:
         """The options of a subject with its files, and its plan; InputError for options that cannot be."""
         files: dict[str, Any] = {
-            name: matching(str(pattern), subject) for name, pattern in self._patterns.items()
+            name: of_each(name, pattern, partial(matching, subject=subject)) for name, pattern in self._patterns.items()
         } | subject.files
         kind = (tuple(sorted(subject.options.items())), tuple(sorted(files)), len(subject.images))
         if kind not in self._known:
@@ -146,7 +157,8 @@ class _Plans:
 def _missing(job: JobOptions) -> Iterator[str]:
     """What is wrong with the files that a subject names: not there, or a text where an image should be."""
     named = [("image", path) for path in job.images]
-    named += [(name, path) for name in FILE_OPTIONS if (path := getattr(job, name)) is not None]
+    whole = {name: path for name in FILE_OPTIONS if (path := getattr(job, name)) is not None and name != "tissues"}
+    named += [*whole.items(), *(("tissues", path) for path in tissue_files(job.tissues))]
     for number, (name, path) in enumerate(named):
         file = path if number == 0 else file_and_volume(path)[0]  # of the first, --volume tells which
         try:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
+from tetopt.model.tissues import FILES_IN_TEXTS
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
 
 TABLE_SUFFIXES = (".tsv", ".csv")
 SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is BIDS's
 SESSION_COLUMNS = ("session", "session_id")
-FILE_OPTIONS = ("mask", "labels", "sizing", "start", "label_names")  # of `tetopt mesh`, that name a file
+FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")  # of `tetopt mesh`, that name a file
 NO_VALUES = ("", "n/a")  # of a cell that says nothing; the second is BIDS's
 LEFT_OUT = "#"  # what the name of a column begins with that is a note of the user's own
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
@@ -87,7 +88,8 @@ def read_table(path: Path) -> list[Subject]:
             problems.append(f"{place}: has no {' and no '.join(missing)}")
             continue
         options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
-        files = {name: _absolute(folder, options.pop(name)) for name in FILE_OPTIONS if name in options}
+        named = [name for name in FILE_OPTIONS if name in options]
+        files = {name: of_each(name, options.pop(name), partial(_absolute, folder)) for name in named}
         options |= {name: str(_absolute(folder, str(file))) for name, file in _mapping_files(options)}
         subjects.append(
             Subject(
@@ -128,10 +130,10 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
     folder = path.parent.resolve()
     n_images = max((len(each.images) for each in subjects), default=1)
     images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
-    files = [name for name in FILE_OPTIONS if any(name in each.files for each in subjects)]
+    named = [name for name in FILE_OPTIONS if any(name in each.files for each in subjects)]
     options = sorted({name for each in subjects for name in each.options})
     session = ["session"] if any(each.session for each in subjects) else []
-    columns = ["subject", *session, *images, *files, *options]
+    columns = ["subject", *session, *images, *named, *options]
     stream = StringIO()
     writer = csv.DictWriter(
         stream, columns, restval="n/a", lineterminator="\n", delimiter="\t" if path.suffix.lower() == ".tsv" else ","
@@ -141,8 +143,15 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
         row = {"subject": each.subject, **({"session": each.session} if each.session else {}), **each.options}
         row |= {name: _relative(folder, file) for name, file in _mapping_files(each.options)}
         row |= {name: _relative(folder, image) for name, image in zip(images, each.images, strict=False)}
-        writer.writerow(row | {name: _relative(folder, file) for name, file in each.files.items()})
+        files = {name: str(of_each(name, file, partial(_relative, folder))) for name, file in each.files.items()}
+        writer.writerow(row | files)
     return stream.getvalue()
+
+
+def of_each(option: str, path: Path | str, function: Callable[[str], Path | str]) -> Path:
+    """What a function makes of an option's file; of tissues, of each of the files between its commas."""
+    parts = str(path).split(",") if option == "tissues" else [str(path)]
+    return Path(",".join(str(function(part.strip())) for part in parts))
 
 
 def write_table(path: Path, subjects: Sequence[Subject]) -> None:
@@ -212,9 +221,9 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
 
 
 def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
-    """The files that mappings among a subject's options name."""
-    for name in MAPPED_OPTIONS:
-        if (file := mapping_file(options.get(name, ""))) is not None:
+    """The files that the texts of a subject's options name."""
+    for name, file_of in FILES_IN_TEXTS.items():
+        if (file := file_of(options.get(name, ""))) is not None:
             yield name, file
 
 
@@ -227,5 +236,5 @@ def _absolute(folder: Path, cell: str) -> Path:
     return Path(os.path.normpath(folder / Path(cell).expanduser()))
 
 
-def _relative(folder: Path, path: Path) -> str:
+def _relative(folder: Path, path: Path | str) -> str:
     return os.path.relpath(path, folder)

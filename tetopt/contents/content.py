@@ -19,6 +19,7 @@ from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
 from tetopt.contents.labels import check_labels, label_channels
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
+from tetopt.contents.probabilities import check_tissues, probable_memberships, tissue_labels, warn_of_sums
 from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -170,7 +171,7 @@ class Content(NamedTuple):
 def content(
     images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
-    keep_components: bool = False, keep_volumes: bool = True,
+    keep_components: bool = False, keep_volumes: bool = True, tissues: Sequence[Image] | None = None,
 ) -> Content:  # fmt: skip
     """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree_mesh` or `optimize`.
 
@@ -198,6 +199,10 @@ def content(
     keep_volumes : bool
         Give labels that are thinner than cells as much volume as their voxels have, by cells of which other labels fill
         more. With False they lose what cells do not show.
+    tissues : sequence of Image, optional
+        Probabilities of tissues, 0 to 1 on the same voxels, instead of labels. They are labels 1 to K in this order, 0
+        where what is left is the most probable, and their interfaces lie where two are as probable, within voxels
+        (`tetopt.contents.probabilities`). Where they sum to more than 1 they are divided by that sum, with a warning.
 
     Returns
     -------
@@ -207,11 +212,12 @@ def content(
     Raises
     ------
     InputError
-        Images of different shapes, wrong weights, labels that are not whole numbers from 0, nothing that counts.
+        Images of different shapes, wrong weights, labels that are not whole numbers from 0, probabilities that are not
+        from 0 to 1, labels as well as tissues, nothing that counts.
 
     See Also
     --------
-    resample_contrast, resample_labels, resample_mask : What lies on other voxels.
+    resample_contrast, resample_labels, resample_tissue, resample_mask : What lies on other voxels.
     foreground_mask : A mask of what is not background.
 
     Examples
@@ -225,19 +231,23 @@ def content(
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
-    _check(images, {"labels": labels, "mask": mask}, weights, label_weight, smooth_interfaces)
+    tissues = _checked_tissues(tissues, labels)
+    others = {f"tissues, number {number}": tissue for number, tissue in enumerate(tissues, 1)}
+    _check(images, {"labels": labels, "mask": mask, **others}, weights, label_weight, smooth_interfaces)
     region = beyond = None
     if mask is not None:
         beyond = continuation(mask, images[0].spacing)
         region = region_of(_part(mask, beyond.part))
         images = [continued(image, beyond) for image in images]
         labels = None if labels is None else continued(labels, beyond)
+        tissues = [continued(tissue, beyond) for tissue in tissues]
+    labels = tissue_labels(tissues) if tissues else labels
     if len(images) == 1 and labels is None and weights[0] > 0.0:
         return plain(images[0])._replace(region=region, continuation=beyond, keeps_components=keep_components)
     members = None
     if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
         factors = supersampling(labels.spacing)
-        members = memberships(labels, factors)
+        members = probable_memberships(tissues, factors) if tissues else memberships(labels, factors)
         if max(factors) > 1:
             images = [finer(image, factors) for image in images]
             region = None if region is None else _finer_region(region, labels, factors)
@@ -306,6 +316,17 @@ def _whole_numbers(
     for row, code in zip(values[len(contrasts) :], codes, strict=True):
         row[:] = np.rint(scale * code).astype(np.int32)[number]
     return values, scale
+
+
+def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> list[Image]:
+    """The probabilities of tissues; none if there are none."""
+    if tissues is None:
+        return []
+    if labels is not None:
+        raise InputError("labels and tissues: give one of them")
+    check_tissues(tissues)
+    warn_of_sums(tissues)
+    return list(tissues)
 
 
 def plain(image: Image | Content) -> Content:

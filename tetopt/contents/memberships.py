@@ -7,7 +7,7 @@ gaps and do not overlap, where three of them meet as well. Between voxel centres
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from math import prod
 from typing import NamedTuple
@@ -116,25 +116,48 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
             off = np.maximum(np.repeat(off, factor, axis), _off_planes(start, axis, factor))
             start = _between_slices(start, axis, factors)
             raw = np.repeat(raw, factor, axis)
+
+    def level_in(row: int, box: tuple[slice, ...]) -> NDArray[np.float32]:
+        return _level(start[box] == row, raw[box] == row, off[box], factors)
+
+    members = gathered(values, start, level_in, prod(factors))
+    if off.any():
+        _merge_crumbs(members.levels, members.partition, members.channel, off == 0.0)
+    return members
+
+
+def gathered(
+    values: NDArray[np.int64],
+    start: NDArray[np.int64],
+    level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
+    parts: int,
+) -> Memberships:
+    """The levels of labels in as few channels as can be, and of each voxel the label whose is the smallest.
+
+    Parameters
+    ----------
+    values : (K,) int
+        Labels, rising.
+    start : (*shape) int
+        Row of `values` of each voxel, to begin with.
+    level_in : callable
+        The level of a row within a box of the voxels; that is called on several threads.
+    parts : int
+        Voxels to one of the labels'.
+    """
     channel = label_channels(start, len(values))
-    check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * n_voxels, what, NO_ROOM)
+    what = f"labels: {len(values)} of them on {start.size} voxels"
+    check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * start.size, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
     boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]
-
-    def level_in(row: int) -> NDArray[np.float32]:
-        box = boxes[row]
-        return _level(start[box] == row, raw[box] == row, off[box], factors)
-
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        for row, level in enumerate(threads.map(level_in, range(len(values)))):
+        for row, level in enumerate(threads.map(level_in, range(len(values)), boxes)):
             shared, least = levels[channel[row]][boxes[row]], smallest[boxes[row]]
             np.minimum(shared, level, out=shared)
             partition[boxes[row]][level < least] = row
             np.minimum(least, level, out=least)
-    if off.any():
-        _merge_crumbs(levels, partition, channel, off == 0.0)
-    return Memberships(values, channel, levels, partition, prod(factors))
+    return Memberships(values, channel, levels, partition, parts)
 
 
 def labels_at(members: Memberships, index: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -217,7 +240,7 @@ def _level(
         smooth = _flowed(level, FINE_SIGMA)
         if fraction.any():
             smooth += fraction * (_flowed(level, BROAD_SIGMA) - smooth)
-        level = np.clip(_with_volume(smooth, raw, max(VOLUME_SIGMA, *factors)), low, high)
+        level = np.clip(with_volume(smooth, raw, max(VOLUME_SIGMA, *factors)), low, high)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 
 
@@ -256,7 +279,7 @@ def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     return once + gaussian(level - once)
 
 
-def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
+def with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
     """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`."""
     mean = level  # over each voxel, of the level that is linear between centres
     for axis in range(level.ndim):

@@ -49,8 +49,8 @@ MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
 # Options that look at all cells or voxels at once, and the values of them that parts take besides none at all.
 PARTS_TAKE: dict[str, Any] = {
-    "mask": None, "background": None, "labels": None, "slice_": None, "target_error": None, "edge_size": None,
-    "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
+    "mask": None, "background": None, "labels": None, "tissues": None, "slice_": None, "target_error": None,
+    "edge_size": None, "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
 }  # fmt: skip
 LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # likewise, if the image is left in its file
 

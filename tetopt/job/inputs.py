@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from tetopt.contents.align import is_same_grid, resample_contrast
 from tetopt.contents.content import SMOOTH_INTERFACES
 from tetopt.contents.labels import check_labels
+from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, sha256
+from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
@@ -86,7 +87,8 @@ def image_and_others(
         moved = aligned(original, whole, str(other))
         is_cropped = part.slice_ is None and part.crop is not None
         if not is_same_grid(original, whole, is_cropped=is_cropped):
-            _say_resampled(other, original, moved, is_contrast=aligned is resample_contrast, is_cropped=is_cropped)
+            is_linear = aligned in (resample_contrast, resample_tissue)
+            _say_resampled(other, original, moved, is_contrast=is_linear, is_cropped=is_cropped)
         if part.slice_ is None:
             return moved
         return part_of(moved, parse_slice(part.slice_), None if part.crop is None else parse_crop(part.crop))
@@ -119,6 +121,24 @@ def file_and_volume(path: Path) -> tuple[Path, int | None]:
     if colon and re.fullmatch("[0-9]{1,18}", volume) and not path.exists():
         return Path(name), int(volume)
     return path, None
+
+
+def tissue_files(path: Path | None) -> list[Path]:
+    """The files of tissues that an option names between commas."""
+    return [] if path is None else [Path(name.strip()) for name in str(path).split(",")]
+
+
+def tissue_volumes(path: Path) -> dict[str, Path]:
+    """The files of tissues, or `FILE:K` for each volume of one, by what the tissues are called; InputError."""
+    files = tissue_files(path)
+    if Path() in files or len(set(files)) < len(files):
+        raise InputError(f"`tissues`: expected different files, separated by commas, got {path}")
+    shape = file_shape(files[0]) if len(files) == 1 else None
+    if shape is not None and len(shape) > 3 and shape[3] > 1 and file_and_volume(files[0])[1] is None:
+        return {f"tissue {k + 1}": Path(f"{path}:{k}") for k in range(shape[3])}
+    names = [file_and_volume(file)[0].name.split(".")[0] for file in files]
+    numbered = [name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names, 1)]
+    return dict(zip(numbered, files, strict=True))
 
 
 def number_of(name: str, text: str) -> float:

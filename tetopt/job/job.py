@@ -196,6 +196,8 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         return int(value)
     if own is str and (isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))):
         return value if isinstance(value, str) else _number_text(value)
+    if own is Path and name == "tissues" and isinstance(value, list | tuple) and value:
+        return Path(",".join(str(_of_kind(name, own, each)) for each in value))
     if own is str and name == "weights" and isinstance(value, list | tuple):
         return ",".join(repr(_of_kind(name, float, each)).removesuffix(".0") for each in value)
     if own is bool and isinstance(value, bool):

@@ -8,14 +8,16 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
-from tetopt.job.inputs import label_table, read_mesh, table_in, warn_of_other_image
+from tetopt.job.inputs import label_table, read_companion, read_mesh, table_in, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
+from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
 from tetopt.measure.quality import Quality, quality
@@ -56,6 +58,7 @@ class Judgement(NamedTuple):
             return []
         inputs, there = table_in(self.loaded, "inputs"), {"mask": self.source.mask, "labels": self.source.labels}
         left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
+        left_out += ["tissues"] * (self.source.labels is None and inputs.get("tissues") is not None)
         images = inputs.get("images")
         return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
 
@@ -138,7 +141,20 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
     )  # fmt: skip
-    return read_source(options)
+    return read_source(options, numbers=None if labels is None else _merged(inputs, labels))
+
+
+def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
+    """The numbers that the mesh's run gave to labels that it merged; none for labels that have them already."""
+    table, sums = inputs.get("merged"), inputs.get("sha256")
+    numbers = {
+        int(old): new
+        for old, new in (table.items() if isinstance(table, dict) else ())
+        if old.isdecimal() and isinstance(new, int) and 0 <= new <= LARGEST_LABEL >= int(old)
+    }
+    if not numbers or (isinstance(sums, dict) and sums.get(labels.name) == checksum(labels)):
+        return numbers
+    return {} if np.isin(read_companion(labels).data, list(numbers.values())).all() else numbers
 
 
 def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:

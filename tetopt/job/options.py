@@ -109,6 +109,17 @@ class RegionOptions:
         False
     )
     labels: Annotated[Path | None, Option("LABELS", "Label image: each cell is to be of one label.")] = None
+    tissues: Annotated[
+        Path | None,
+        Option("FILE,...", "Tissue probabilities instead of labels: a file each, or one in 4-D; 0 is what they leave."),
+    ] = None
+    merge: Annotated[
+        str | None,
+        Option(
+            "GROUPS",
+            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a file .toml.',
+        ),
+    ] = None
     weights: Annotated[str | None, Option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (
         None
     )

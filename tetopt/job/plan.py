@@ -27,6 +27,7 @@ from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
+from tetopt.model.tissues import groups_of, merge_file
 from tetopt.parts.division import Division
 from tetopt.parts.work import VolumeFile
 from tetopt.start.label_sizes import SizesByLabel
@@ -186,7 +187,7 @@ def resolved(job: JobOptions) -> Plan:
                 f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
             )
     completed = _completed(job, mode)
-    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels)
+    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
         raise InputError("`method` paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
     return Plan(mode, completed, job)
@@ -203,10 +204,16 @@ def _check_source(job: JobOptions) -> None:
         raise InputError("`mask` and `background`: give one of them")
     if job.keep_components and job.mask is None and job.background is None:
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
-    if job.labels is None:
+    if job.labels is not None and job.tissues is not None:
+        raise InputError("`labels` and `tissues`: give one of them")
+    if job.merge is not None and job.labels is None:
+        raise InputError("`merge`: there are no `labels`")
+    if job.labels is None and job.tissues is None:
         for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
             if getattr(job, name) is not None:
                 raise InputError(f"`{name}`: there are no `labels`")
+    if job.merge is not None and merge_file(job.merge) is None:
+        groups_of(job.merge)
 
 
 def _check_numbers(job: JobOptions) -> None:
@@ -295,7 +302,7 @@ def _pictures(job: JobOptions) -> list[Path]:
         return []
     names = ["slice.png", "rho.png", "energies.png"]
     names += [] if job.mask is None and job.background is None else ["boundary.png"]
-    names += [] if job.labels is None else ["labels.png"]
+    names += [] if job.labels is None and job.tissues is None else ["labels.png"]
     names += ["thumbnail.png"]
     return list(checked_outputs(results_folder(job.figures), names, job.force).values())
 

@@ -16,7 +16,7 @@ from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.image import Image
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
 from tetopt.io.zarr_images import is_zarr
-from tetopt.job.inputs import file_and_volume
+from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
 
@@ -108,7 +108,7 @@ def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:
 def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
     """What the options and headers tell of a run on voxels of this shape; each file is a channel."""
     job, order, ndim = plan.job, plan.order, len(shape)
-    files = [*job.images, *(path for path in (job.mask, job.labels) if path is not None)]
+    files = [*job.images, *(path for path in (job.mask, job.labels, *tissue_files(job.tissues)) if path is not None)]
     runs = SEARCH_RUNS if plan.job.target_error is not None else 1
     corners = float(DEFAULT_NODES[ndim] if nodes is None else nodes)
     if order == 2 and plan.mode != "start":
@@ -116,10 +116,11 @@ def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
         runs = runs if plan.job.spacing is not None else max(runs, QUADRATIC_RUNS)
     n_read = sum(prod(shape if is_zarr(path) else file_shape(file_and_volume(path)[0]) or shape) for path in files)
     has_region = job.mask is not None or job.background is not None
+    is_labelled = job.labels is not None or job.tissues is not None
     return RunSize(
         n_read=n_read, n_voxels=prod(shape), n_nodes=round(corners), iterations=plan.job.iterations or 0,
-        n_channels=len(job.images) + (job.labels is not None) + has_region, ndim=ndim, mode=plan.mode,
-        order=order, runs=runs, has_region=has_region, has_memberships=job.labels is not None,
+        n_channels=len(job.images) + is_labelled + has_region, ndim=ndim, mode=plan.mode,
+        order=order, runs=runs, has_region=has_region, has_memberships=is_labelled,
         is_drawn=job.figures is not None,
     )  # fmt: skip
 

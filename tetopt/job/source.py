@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,18 +12,30 @@ from numpy.typing import NDArray
 
 from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 from tetopt.contents.content import Content, content, continued
+from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
+from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.job.events import note
-from tetopt.job.inputs import balance_of, image_and_others, label_table, number_of
+from tetopt.job.events import note, warning
+from tetopt.job.inputs import (
+    balance_of,
+    file_and_volume,
+    image_and_others,
+    label_table,
+    listed,
+    number_of,
+    tissue_files,
+    tissue_volumes,
+)
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
-from tetopt.model.labels import TABLE_TEXT, table_words
+from tetopt.model.labels import TABLE_TEXT, label_words, table_of_labels, table_words
 from tetopt.model.sets import box_of, box_text
+from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
 
 
 class Source(NamedTuple):
@@ -96,13 +110,19 @@ class Source(NamedTuple):
         return rows
 
 
-def read_source(options: SourceOptions, label_names: Path | None = None) -> Source:
-    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image."""
+def read_source(
+    options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None
+) -> Source:  # fmt: skip
+    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image.
+
+    Labels get other `numbers`, if they are given, and are merged otherwise as the options and their names say.
+    """
     paths = options.images
-    table = label_table(label_names)
     image, beside = image_and_others(paths[0], options)
+    labels, table, numbers, tissues, is_own = _labelling(options, image, beside, label_names, numbers)
+    if labels is not None and is_own and numbers:
+        image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
-    labels = None if options.labels is None else beside(options.labels, resample_labels)
     mask = None if options.mask is None else beside(options.mask, resample_mask)
     level = None
     if options.background is not None:
@@ -113,16 +133,22 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
     balance = balance_of(options)
-    if options.weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
-        note("the image is its own labels: only these count")
+    if options.weights is None and is_own:
+        note(f"the image is {'its own labels' if tissues is None else 'one of the tissues'}: only these count")
         balance = balance._replace(weights=[0.0])
-    represented = content(contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components)
-    files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
+    represented = content(
+        contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
+        keep_components=options.keep_components,
+    )  # fmt: skip
+    of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
+    files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
     inputs = {
         "images": [path.name for path in paths], "weights": balance.weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
+        **({} if tissues is None else {"tissues": [path.name for path in of_tissues]}),
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
+        **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
@@ -134,6 +160,63 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+class ReadLabels(NamedTuple):
+    """Labels of the image's voxels, as they were read."""
+
+    labels: Image | None = None
+    table: LabelTable = NO_TABLE
+    numbers: Mapping[int, int] = {}
+    tissues: list[Image] | None = None  # probabilities, which the labels are the largest of
+    is_own: bool = False  # whether the image is nothing else
+
+
+def _labelling(
+    options: SourceOptions, image: Image, beside: Callable[..., Image], label_names: Path | None,
+    numbers: Mapping[int, int] | None,
+) -> ReadLabels:  # fmt: skip
+    """Labels, merged as is asked for, or tissues, beside the image."""
+    table, is_alone = label_table(label_names), len(options.images) == 1
+    if options.tissues is not None:
+        volumes = tissue_volumes(options.tissues)
+        tissues = [beside(path, resample_tissue) for path in volumes.values()]
+        if not table.names:
+            table = LabelTable(dict(enumerate(volumes, 1)), table.colours)
+        is_own = is_alone and options.images[0] in tissue_files(options.tissues)
+        return ReadLabels(tissue_labels(tissues), table, {}, tissues, is_own)
+    if options.labels is None:
+        return ReadLabels(table=table)
+    labels = beside(options.labels, resample_labels)
+    is_own = is_alone and np.array_equal(labels.data, image.data)
+    return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
+
+
+def _merged(
+    labels: Image, table: LabelTable, options: SourceOptions, numbers: Mapping[int, int] | None
+) -> tuple[Image, LabelTable, Mapping[int, int]]:  # fmt: skip
+    """The labels merged as the options, or names that they share, say; their table; and which have which new number."""
+    if numbers is not None:
+        return renumbered(labels, numbers), table, numbers
+    if options.merge is not None:
+        try:
+            merged = merge_labels(labels, options.merge, table.names)
+        except InputError as error:
+            raise InputError(f"{options.labels}: {error}") from error
+        missing = [name for label, name in merged.names.items() if label not in merged.numbers.values()]
+        if missing and not is_preset(options.merge):
+            warning(f"`merge`: {options.labels} has no label of {listed(missing)}")
+        sizes = sorted(Counter(merged.numbers.values()).items())
+        note(f"labels merged: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
+        return merged.labels, LabelTable(merged.names, {}), merged.numbers
+    present = np.unique(labels.data)
+    numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}
+    if not numbers:
+        return labels, table, numbers
+    words = [f"{old} into {label_words(new, table.names)}" for old, new in sorted(numbers.items())]
+    note(f"labels merged, as they share a name: {listed(words)}")
+    left = set(table.names) - set(numbers_by_name(table.names))
+    return renumbered(labels, numbers), table_of_labels(table, left), numbers
 
 
 def whose_variance(content: Content) -> str:

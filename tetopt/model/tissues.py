@@ -1,0 +1,223 @@
+"""Labels merged into tissues: by groups in words, of a file or of a program that is known, or by names they share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.model.labels import labels_named
+from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
+from tetopt.system.incoming import toml_of
+
+REST = "*"  # all labels that no group names, but 0
+UNGROUPED_LISTED = 20  # labels in a message
+GROUP = re.compile(r"\s*(?:(\d{1,9})\s*:)?\s*([^=:;*]*[^=:;*\s])\s*=([^=;]*)")
+RANGE = re.compile(r"(\d{1,9})(?:\s*-\s*(\d{1,9}))?")
+
+
+class LabelGroup(NamedTuple):
+    """Labels that become one."""
+
+    label: int
+    name: str
+    members: tuple[str, ...]  # numbers, ranges, names, `REST`
+
+
+class Merged(NamedTuple):
+    """Labels that were merged; made by `merge_labels`.
+
+    Parameters
+    ----------
+    labels : Image
+        With the numbers of groups.
+    names : dict of int to str
+        Of all groups, by number, whether the image has them or not.
+    numbers : dict of int to int
+        The new number of each of the image's labels, by the old one.
+
+    Examples
+    --------
+    >>> labels = tetopt.Image(np.array([[0.0, 2.0, 41.0, 4.0]]))
+    >>> tetopt.merge_labels(labels, "aseg").numbers
+    {0: 0, 2: 1, 4: 3, 41: 1}
+    """
+
+    labels: Image
+    names: dict[int, str]
+    numbers: dict[int, int]
+
+
+def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = None) -> Merged:
+    """Merge labels into tissues.
+
+    Parameters
+    ----------
+    labels : Image
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
+    merge : str
+        Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N where one is
+        N:NAME=LABELS. LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*`` for all that no
+        group has; 0 stays 0 unless a group has it. Or the name of such a table: "aseg" (FreeSurfer), "synthseg",
+        "simnibs"; or a file .toml, of a line NAME = LABELS for each.
+    names : dict of int to str, optional
+        What the image's labels are called, for groups that list names.
+
+    Returns
+    -------
+    Merged
+        The labels with their new numbers, and the names of these.
+
+    Raises
+    ------
+    InputError
+        Labels that are not such numbers; groups that cannot be read; a label of two groups, or of none.
+
+    See Also
+    --------
+    content : Takes the labels.
+
+    Examples
+    --------
+    >>> labels = tetopt.Image(np.array([[0.0, 2.0, 41.0, 3.0, 507.0]]))
+    >>> merged = tetopt.merge_labels(labels, "white=2,41; grey=3,42; 5:soft=*")
+    >>> merged.labels.data.tolist(), merged.names
+    ([[0.0, 1.0, 1.0, 2.0, 5.0]], {1: 'white', 2: 'grey', 5: 'soft'})
+    """
+    check_labels("labels", labels)
+    groups = groups_of(merge)
+    owner, rest = _members(groups, names or {})
+    present = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel())).tolist()
+    owner.setdefault(0, 0)
+    lost = [label for label in present if label not in owner]
+    if lost and rest is None:
+        listed = ", ".join(map(str, lost[:UNGROUPED_LISTED])) + (", ..." if len(lost) > UNGROUPED_LISTED else "")
+        raise InputError(
+            f"`merge`: expected each label of the image in a group, got none for {listed}; add them to a group, or "
+            f"give NAME={REST} for all others"
+        )
+    numbers = {label: owner.get(label, rest or 0) for label in present}
+    return Merged(renumbered(labels, numbers), {group.label: group.name for group in groups}, numbers)
+
+
+def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
+    """The labels with other numbers; those that have none stay as they are."""
+    table = np.arange(LARGEST_LABEL + 1, dtype=labels.data.dtype)
+    table[list(numbers)] = list(numbers.values())
+    return Image(table[labels.data.astype(np.uint16)], labels.affine)
+
+
+def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
+    """The smallest label of the same name, of each that has a smaller one."""
+    first: dict[str, int] = {}
+    for label in sorted(names):
+        first.setdefault(names[label], label)
+    return {label: first[name] for label, name in names.items() if first[name] != label}
+
+
+def is_preset(merge: str) -> bool:
+    """Whether a text is the name of a table of groups that comes with tetopt."""
+    return merge.strip() in _presets()
+
+
+def merge_file(merge: str) -> Path | None:
+    """The file that a text names; None if it is the groups, or a preset's name."""
+    return Path(merge) if merge.lower().endswith(".toml") else None
+
+
+FILES_IN_TEXTS: dict[str, Callable[[str], Path | None]] = {
+    **dict.fromkeys(MAPPED_OPTIONS, mapping_file),
+    "merge": merge_file,
+}  # options whose text may name a file, and the file that it names
+
+
+def groups_of(merge: str) -> list[LabelGroup]:
+    """The groups of a text as `merge_labels` takes it.
+
+    Raises
+    ------
+    InputError
+        A text of another kind; a name or a number twice; a file that cannot be read.
+    """
+    if (file := merge_file(merge)) is not None:
+        try:
+            return _of_table(toml_of(file, "table of groups of labels"))
+        except InputError as error:
+            raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
+    if is_preset(merge):
+        return _of_table(_presets()[merge.strip()])
+    return _checked([_of_words(words) for words in merge.split(";") if words.strip()])
+
+
+def _of_table(table: Mapping[str, Any]) -> list[LabelGroup]:
+    """The groups of a table, one for each key."""
+    rows = {name: value if isinstance(value, list) else [value] for name, value in table.items()}
+    return _checked([_of_words(f"{name}={','.join(map(str, values))}") for name, values in rows.items()])
+
+
+def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
+    """Number, name and labels of NAME=LABELS."""
+    match = GROUP.fullmatch(words)
+    members = tuple(part.strip() for part in match[3].split(",")) if match else ()
+    if match is None or not all(members):
+        raise InputError(
+            f'`merge`: expected NAME=LABELS, separated by semicolons, such as "white=2,41; grey=3,42; soft=500-530", a '
+            f'file .toml, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
+        )
+    return match[1], " ".join(match[2].split()), members
+
+
+def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelGroup]:
+    """The groups with their numbers, which differ, as their names do."""
+    rows = rows or [_of_words("")]  # which is none
+    groups = [LabelGroup(k if row[0] is None else int(row[0]), *row[1:]) for k, row in enumerate(rows, 1)]
+    for what in ("name", "label"):
+        taken = [getattr(group, what) for group in groups]
+        if twice := [each for each in taken if taken.count(each) > 1]:
+            raise InputError(f"`merge`: expected another {what} for each group, got {twice[0]} twice")
+    if max(group.label for group in groups) > LARGEST_LABEL:
+        raise InputError(f"`merge`: expected numbers of groups up to {LARGEST_LABEL}")
+    if sum(REST in group.members for group in groups) > 1:
+        raise InputError(f"`merge`: expected {REST} in one group, got it in two")
+    return groups
+
+
+def _members(groups: list[LabelGroup], names: Mapping[int, str]) -> tuple[dict[int, int], int | None]:
+    """The group's number of each label that one has, and of all others."""
+    owner: dict[int, int] = {}
+    rest = None
+    for group in groups:
+        for word in group.members:
+            if word == REST:
+                rest = group.label
+                continue
+            for label in _labels_of(word, names):
+                if owner.setdefault(label, group.label) != group.label:
+                    other = next(each.name for each in groups if each.label == owner[label])
+                    raise InputError(f"`merge`: label {label} is in two groups, {other} and {group.name}; name it once")
+    return owner, rest
+
+
+def _labels_of(word: str, names: Mapping[int, str]) -> list[int]:
+    """The labels that a number, a range or a name means."""
+    if (match := RANGE.fullmatch(word)) is None:
+        try:
+            return labels_named(word, names)
+        except InputError as error:
+            raise InputError(f"`merge`: {error}") from error
+    first, last = int(match[1]), int(match[2] or match[1])
+    if not first <= last <= LARGEST_LABEL:
+        raise InputError(f"`merge`: expected labels, or a rising range of them, up to {LARGEST_LABEL}, got {word}")
+    return list(range(first, last + 1))
+
+
+@cache
+def _presets() -> dict[str, dict[str, Any]]:
+    return toml_of(Path(__file__).with_name("tissues.toml"), "table of presets")
