@@ -23,6 +23,7 @@ from tetopt.mesh import Mesh
 
 LEAST_JACOBIAN = 0.2  # of a curved cell's Jacobian determinant anywhere, over the straight cell's
 MOST_BENT = 0.25  # of an edge's length: a level further off its middle is another part of the surface
+ENDS_VOXELS = 0.5  # of an edge's ends off the levels: further, cells do not follow them there
 LEAST_PART = 0.25  # of the way to the level: an edge that may not go so far stays straight
 
 
@@ -71,9 +72,9 @@ class _Surfaces(NamedTuple):
 def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tuple[Mesh, Curving | None]:
     """The mesh with midpoints, those of edges on interfaces and on the mask's surface on the smooth levels.
 
-    An edge stays straight where its own ends are off the level, where the level is not found within a quarter of the
-    edge's length, and where a cell's Jacobian determinant could fall below a fifth of the straight cell's: all edges of
-    such a cell go half of the way, a quarter, or none of it.
+    An edge stays straight where its own ends are more than half a voxel off the level, where the level is not found
+    within a quarter of the edge's length, and where a cell's Jacobian determinant could fall below a fifth of the
+    straight cell's: all edges of such a cell go half of the way, a quarter, or none of it.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tu
     middle = index[ends].mean(axis=1)
     at, is_found = _brought(surfaces, middle, _ways(content.image)[is_on @ (1 << np.arange(mesh.ndim))])
     for end in ends.T:
-        is_found &= (np.abs(_values(surfaces, index[end])) < NEAR_CURVE_VOXELS).all(axis=1)
+        is_found &= (np.abs(_values(surfaces, index[end])) < ENDS_VOXELS).all(axis=1)
     off = (at - middle) @ content.image.affine[:-1, :-1].T
     length = np.linalg.norm(mesh.points[ends[:, 1]] - mesh.points[ends[:, 0]], axis=1)
     is_found &= np.linalg.norm(off, axis=1) <= MOST_BENT * length

@@ -8,7 +8,7 @@ one that two sets hold from opposite sides is turned as in the first of them.
 
 A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as `Mesh::SetCurvature(2)` makes one: vertices,
 then the middles of edges in the order in which the elements first name them. MFEM takes elements with such a function
-for curved ones; these are straight.
+for curved ones, which those on interfaces may be.
 
 The comments at the head tell coordinates, units, each material's constants and attributes, and the loads.
 `mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` marks where a condition holds.
