@@ -23,7 +23,7 @@ from tetopt.mesh import Mesh
 
 LEAST_JACOBIAN = 0.2  # of a curved cell's Jacobian determinant anywhere, over the straight cell's
 MOST_BENT = 0.25  # of an edge's length: a level further off its middle is another part of the surface
-ENDS_VOXELS = 0.5  # of an edge's ends off the levels: further, cells do not follow them there
+ENDS_VOXELS = 0.5  # between levels at an edge's ends, twice the distance of an interface: further, cells do not follow
 LEAST_PART = 0.25  # of the way to the level: an edge that may not go so far stays straight
 
 
@@ -49,7 +49,7 @@ class Curving(NamedTuple):
     --------
     >>> labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
     >>> result = tetopt.mesh_image(tetopt.content(labels, labels), 600, order=2)
-    >>> result.curving.n_on_level > 100, result.curving.least_jacobian >= 0.2
+    >>> result.curving.n_on_level > 50, result.curving.least_jacobian >= 0.2
     (True, True)
     """
 
@@ -72,9 +72,10 @@ class _Surfaces(NamedTuple):
 def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tuple[Mesh, Curving | None]:
     """The mesh with midpoints, those of edges on interfaces and on the mask's surface on the smooth levels.
 
-    An edge stays straight where its own ends are more than half a voxel off the level, where the level is not found
-    within a quarter of the edge's length, and where a cell's Jacobian determinant could fall below a fifth of the
-    straight cell's: all edges of such a cell go half of the way, a quarter, or none of it.
+    An edge stays straight where its own ends are more than half a voxel off the mask's surface, or a quarter off an
+    interface, where the level is not found within a quarter of the edge's length, and where a cell's Jacobian
+    determinant could fall below a fifth of the straight cell's: all edges of such a cell go half of the way, a quarter,
+    or none of it.
 
     Parameters
     ----------
