@@ -5,12 +5,13 @@ import pytest
 import schemas
 from commands import exit_code, numbers_in
 from meshes import with_bent_edges
-from models import sample_model
+from models import sample_image, sample_model
 
 import tetopt
 from tetopt.geometry.quadratic import numbered_edges
 
 
+@pytest.mark.full
 def test_a_run_counts_and_writes_curved_edges(tmp_path):
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
     tetopt.save_image(tmp_path / "l.nii.gz", labels)
@@ -36,6 +37,21 @@ def test_a_run_counts_and_writes_curved_edges(tmp_path):
     np.testing.assert_array_equal(solved.u, again.u)
     straight = tetopt.Mesh(result.mesh.points, result.mesh.cells)
     assert np.abs(solved.u - tetopt.solve(tetopt.build_model(back._replace(mesh=straight))).u).max() > 1e-4
+
+
+def test_a_start_with_curved_edges_loses_them_without_labels(tmp_path):
+    image = sample_image()
+    tetopt.save_image(tmp_path / "a.nii.gz", image)
+    tetopt.save_mesh(tmp_path / "s.vtu", with_bent_edges(tetopt.lattice_mesh(image, nodes=60), 0.05), order=2)
+    for iterations in (1, 0):
+        told = []
+        job = tetopt.Job(
+            images=tmp_path / "a.nii.gz", start=tmp_path / "s.vtu", output=tmp_path / f"{iterations}.vtu", order=2,
+            iterations=iterations,
+        )  # fmt: skip
+        result = tetopt.run(job, on=told.append)
+        is_lost = any("curved edges become straight" in event.text for event in told)
+        assert is_lost == (result.mesh.midpoints is None) == (iterations == 1)
 
 
 @pytest.mark.parametrize("is_folded", [False, True])

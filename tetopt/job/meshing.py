@@ -88,6 +88,8 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     )  # fmt: skip
     if result.curving is not None:
         note(curving_in_words(result.curving))
+    elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
+        note("`start`: its curved edges become straight, as neither labels nor a mask say where their nodes belong")
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))
