@@ -11,7 +11,10 @@ import numpy as np
 from naive import barycentric_functions, dot
 from scipy.spatial import Delaunay
 
+from tetopt.geometry.check import scaled_jacobians
+from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented, volumes
+from tetopt.mesh import Mesh
 
 # Single triangles
 #
@@ -213,3 +216,17 @@ def delaunay_box(rng, shape, n_nodes):
     cells = Delaunay(points).simplices
     cells = cells[np.abs(volumes(points, cells)) > 1e-12]  # Qhull's flat cells on the walls
     return points, oriented(points, cells)
+
+
+def with_bent_edges(mesh, fraction):
+    """The mesh with midpoints moved at random by about a fraction of the edge, or less where a cell would fold."""
+    edges = numbered_edges(mesh.cells)[0]
+    ends = mesh.points[edges]
+    moves = np.random.default_rng(6).normal(size=(len(edges), mesh.ndim)) * np.linalg.norm(
+        np.diff(ends, axis=1), axis=2
+    )
+    while True:
+        bent = Mesh(mesh.points, mesh.cells, ends.mean(axis=1) + fraction * moves)
+        if scaled_jacobians(bent).min() > 0.2:
+            return bent
+        fraction *= 0.8

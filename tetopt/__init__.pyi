@@ -15,6 +15,7 @@ from .energy.discretization import E_D as E_D
 from .energy.geometric import E_G as E_G
 from .energy.sampling import CellMoments as CellMoments, cell_moments as cell_moments, cell_of_voxel as cell_of_voxel
 from .engine.fast import optimize as optimize
+from .engine.curving import Curving as Curving
 from .engine.loop import IterationRecord as IterationRecord, MeshingResult as MeshingResult
 from .engine.meshing import mesh_image as mesh_image
 from .engine.paper import optimize_paper as optimize_paper

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
@@ -32,6 +33,10 @@ class Mesh:
     cells : (M, n+1) array of int64
         Node indices of each cell, positively oriented: the vectors from the first node to the others form a
         right-handed frame. Read-only.
+    midpoints : (E, n) array of float64, optional
+        Places of the nodes in the middle of edges, mm, of quadratic cells whose edges may be curved; in the order of
+        `tetopt.geometry.quadratic.numbered_edges`, by their ends. Without them edges are straight. Linear cells, and
+        everything that is measured or drawn of a mesh, go by the corners alone. Read-only.
 
     Raises
     ------
@@ -54,8 +59,9 @@ class Mesh:
 
     points: NDArray[np.float64]
     cells: NDArray[np.int64]
+    midpoints: NDArray[np.float64] | None
 
-    def __init__(self, points: ArrayLike, cells: ArrayLike) -> None:
+    def __init__(self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None) -> None:
         try:
             points = np.array(points, dtype=np.float64, order="C")
             cells = np.asarray(cells)
@@ -85,6 +91,7 @@ class Mesh:
         cells.setflags(write=False)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "cells", cells)
+        object.__setattr__(self, "midpoints", None if midpoints is None else _checked_midpoints(midpoints, cells, n))
 
     @property
     def ndim(self) -> int:
@@ -350,3 +357,17 @@ class Mesh:
         from tetopt.geometry.topology import boundary_facets
 
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
+
+
+def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+    try:
+        places = np.array(midpoints, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"mesh midpoints: expected an array of numbers ({error})") from error
+    expected = (len(numbered_edges(cells)[0]), n)
+    if places.shape != expected or not np.isfinite(places).all():
+        raise InputError(
+            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, a row for each edge, got {places.shape}"
+        )
+    places.setflags(write=False)
+    return places

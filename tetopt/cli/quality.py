@@ -41,7 +41,8 @@ def quality_command(
     numbers.save(came.numbers)
     size, source = came.numbers["size"], came.source
     table = new_table("", escape(mesh.name))
-    add_quality(table, came.shape, in_all=[size["n_nodes_in_all"]] if came.loaded.order == 2 else [])
+    in_all = [size["n_nodes_in_all"]] if came.loaded.order == 2 else []
+    add_quality(table, came.shape, in_all=in_all, jacobian=came.numbers.get("min_scaled_jacobian"))
     if source is not None and came.fit is not None:
         _add_fit(table, came.fit, source, came.left_out)
     out.print(table)

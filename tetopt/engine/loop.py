@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.labels import colours_by_number
 from tetopt.energy.sampling import SamplingGrid
+from tetopt.engine.curving import Curving
 from tetopt.errors import InputError
 from tetopt.geometry.box import facets_on_sides
 from tetopt.image import Image, transformed
@@ -119,6 +120,8 @@ class MeshingResult(NamedTuple):
         Of the content's variance, that is left in the cells: E_D over variance times volume. Of `mesh_image` alone.
     n_dropped : int
         Connected components that were left out of the mesh, since the mask does not have them.
+    curving : Curving, optional
+        Of order 2, with a mask or smooth labels: how many edges there have their mid-edge node on the smooth level.
 
     Examples
     --------
@@ -141,6 +144,7 @@ class MeshingResult(NamedTuple):
     violated: Mapping[str, str] = MappingProxyType({})
     fraction: float | None = None
     n_dropped: int = 0
+    curving: Curving | None = None
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
         """Show the mesh in 3-D by pyvista, as `Mesh.plot` does; by default in the colours of its labels, if it has any.

@@ -19,6 +19,7 @@ import numpy as np
 
 from tetopt.contents.content import Content, plain
 from tetopt.engine.cost import meshing_bytes
+from tetopt.engine.curving import curved
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
     GRADED_ITERATIONS,
@@ -120,7 +121,8 @@ def mesh_image(
         order 2 up to 1.15 times with a gradation of 0.5.
     order : {1, 2}
         Of the cells that the mesh is for (`tetopt.geometry.quadratic`). With 2 `nodes` counts mid-edge nodes, too:
-        about a seventh of them are the mesh's own (a quarter in 2-D), as many as up to three runs find.
+        about a seventh of them are the mesh's own (a quarter in 2-D), as many as up to three runs find. With a mask or
+        smooth labels the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (`curving` counts them).
     watch : callable
         Called for each run with its initial mesh and a function that does it; returns the run's result. It may set up
         what watches a run: `lambda initial, run: run(callback=print)`.
@@ -219,7 +221,15 @@ def mesh_image(
     else:
         result = begun(nodes)
     result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
+    if order == 2:
+        result = _curved(result, content)
     return result._replace(seconds_start=time.perf_counter() - begin - sum(seconds), seconds_run=sum(seconds))
+
+
+def _curved(result: MeshingResult, content: Content) -> MeshingResult:
+    """The result with the mid-edge nodes of interfaces and of a mask's surface on the smooth levels."""
+    mesh, curving = curved(result.mesh, content, result.labels)
+    return result._replace(mesh=mesh, curving=curving)
 
 
 def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:

@@ -136,8 +136,10 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
     Raises
     ------
     InputError
-        A mesh without any voxel centre.
+        A mesh without any voxel centre, or one of curved cells, in which no voxel's place is looked up.
     """
+    if mesh.midpoints is not None and order_of(mesh, u) == 2:
+        raise InputError("compare: expected straight edges, got a mesh with midpoints; solve Mesh(points, cells)")
     owner = cell_of_voxel(exact.modulus, mesh).ravel()
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:

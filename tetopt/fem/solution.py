@@ -22,13 +22,15 @@ from tetopt.fem.elasticity import (
     Method,
     Outside,
     System,
+    cell_means,
     constrained,
     gauss_strains,
+    gauss_volumes,
     lame_constants,
     on_one_blas_thread,
     solved_in_steps,
 )
-from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order
+from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order, on_curved_rule, shape_values
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
 from tetopt.model.averages import gauss_young
@@ -167,8 +169,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     u, n_iterations = solved_in_steps(system, method)
     strain = gauss_strains(model.mesh, u)
     stress = _stress(strain, young, nu)
-    v, weights = volumes(model.mesh.points, model.mesh.cells), gauss_rule(model.mesh.ndim, model.order)[1]
-    strain_energy = 0.5 * float((v[:, None] * weights * (strain * stress).sum(axis=(2, 3))).sum())
+    strain_energy = 0.5 * float((gauss_volumes(model.mesh, model.order) * (strain * stress).sum(axis=(2, 3))).sum())
     pull = -task.outside.springs[:, None] * u
     # K has the springs, whose pull is thus on the body's side: what is left over is the supports'.
     reaction = (system.K @ u.ravel()).reshape(u.shape) - task.outside.forces
@@ -189,13 +190,14 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
 
     That of each cell's material; or, of moduli at the nodes, the linear interpolation; or the model's own there.
     """
+    is_curved = model.mesh.midpoints is not None and model.order == 2
     if model.gauss_young is not None:
-        return model.gauss_young
+        return on_curved_rule(model.gauss_young) if is_curved else model.gauss_young
     if model.node_young is not None:
         return gauss_young(model.node_young, model.mesh, model.order)
     assert model.materials is not None, "who asks for moduli has checked that there are some"
     of_cell = model.materials.young[model.materials.of_cell]
-    return np.repeat(of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order)[1]), axis=1)
+    return np.repeat(of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order, is_curved)[1]), axis=1)
 
 
 def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -248,7 +250,8 @@ def weight_forces(
 
     Each node of a cell gets the integral of its shape function: with order 1 as much as the others; with order 2 a
     triangle's weight goes to the middles of its edges alone, and of a tetrahedron's a fifth to each of these and -1/20
-    to each corner (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces).
+    to each corner (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces). In a
+    curved cell the integral is taken by its Gauss points.
     """
     n = mesh.ndim
     points, cells = of_order(mesh.points, mesh.cells, order)
@@ -258,7 +261,11 @@ def weight_forces(
         corner, edge = (0.0, 1.0 / 3.0) if n == 2 else (-1.0 / 20.0, 1.0 / 5.0)
         fractions = np.array([corner] * (n + 1) + [edge] * len(cell_edges(n)))
     mass = KG_PER_MM3 * density * volumes(mesh.points, mesh.cells)
-    at_node = np.bincount(cells.ravel(), weights=(mass[:, None] * fractions).ravel(), minlength=len(points))
+    weights = mass[:, None] * fractions
+    if order == 2 and mesh.midpoints is not None:
+        shapes = shape_values(gauss_rule(n, 2, is_curved=True)[0], 2)
+        weights = (KG_PER_MM3 * density)[:, None] * np.einsum("cq,qa->ca", gauss_volumes(mesh, 2), shapes)
+    at_node = np.bincount(cells.ravel(), weights=weights.ravel(), minlength=len(points))
     return at_node[:, None] * acceleration
 
 
@@ -292,14 +299,16 @@ def von_mises(stress: NDArray[np.float64]) -> NDArray[np.float64]:
 def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values at Gauss points (M, Q, ...) brought to the nodes of the order that has Q of them, (N, ...).
 
-    Within a cell they are linear, which is what strains of order 2 are; a node has the mean by volume over the cells
-    around it.
+    Within a cell they are linear, which is what strains of order 2 are, or, at the points of a curved cell, the linear
+    ones of least squares; a node has the mean by (straight) volume over the cells around it.
     """
     n, n_places = mesh.ndim, values.shape[1]
     order = 1 if n_places == 1 else 2
     cells = of_order(mesh.points, mesh.cells, order)[1]
     if order == 2:
-        at_corners = np.linalg.inv(gauss_rule(n, 2)[0])  # (n+1, Q): linear values are those at the corners, weighted
+        # (n+1, Q): linear values are those at the corners, weighted.
+        places = gauss_rule(n, 2, is_curved=n_places > n + 1)[0]
+        at_corners = np.linalg.inv(places) if len(places) == n + 1 else np.linalg.pinv(places)
         at_nodes = np.concatenate([at_corners, at_corners[cell_edges(n)].mean(axis=1)])
     else:
         at_nodes = np.ones((n + 1, 1))
@@ -379,9 +388,9 @@ def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFi
     n = mesh.ndim
     strain_nodes, stress_nodes = node_means(mesh, solution.strain), node_means(mesh, solution.stress)
     cell_data = {
-        "strain": solution.strain.mean(axis=1).reshape(-1, n * n),
-        "stress": solution.stress.mean(axis=1).reshape(-1, n * n),
-        "von_mises": von_mises(solution.stress).mean(axis=1),
+        "strain": cell_means(solution.strain).reshape(-1, n * n),
+        "stress": cell_means(solution.stress).reshape(-1, n * n),
+        "von_mises": cell_means(von_mises(solution.stress)),
     }
     point_data = {
         "displacement": solution.u,

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
+from tetopt.geometry.quadratic import cell_edges, curved_rule, gauss_rule, jacobian_ratios, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
 
@@ -30,10 +31,10 @@ def check_mesh(
     """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
 
     In a mesh every node is used, and no two lie in the same place; every cell is positively oriented, has distinct
-    corners and is there once; every facet is in one or two cells, which lie on its two sides (so the mesh conforms and
-    does not fold); the boundary is closed, a manifold (`manifold_problems`), and one piece. With labels, so are their
-    interfaces manifolds. With an image no node lies beyond its box; if the mesh fills that, the boundary's facets lie
-    on the box's faces, and the cells' volumes add up to it.
+    corners and is there once, and no mid-edge node folds it; every facet is in one or two cells, which lie on its two
+    sides (so the mesh conforms and does not fold); the boundary is closed, a manifold (`manifold_problems`), and one
+    piece. With labels, so are their interfaces manifolds. With an image no node lies beyond its box; if the mesh fills
+    that, the boundary's facets lie on the box's faces, and the cells' volumes add up to it.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def check_mesh(
         problems = _problems_of_facets(mesh)
     if problems:
         return problems
-    problems = _problems_of_pieces(mesh) if is_whole else []
+    problems = _problems_of_curves(mesh) + (_problems_of_pieces(mesh) if is_whole else [])
     problems += manifold_problems(mesh) if is_manifold else []
     problems += [] if of_cell is None else manifold_problems(mesh, of_cell)
     problems += [] if image is None else _problems_with_box(mesh, image, is_filled)
@@ -120,6 +121,25 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
     if (counts > 1).any():
         problems.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
     return problems
+
+
+def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+    """The least Jacobian determinant of each cell of order 2 over the straight cell's, (M,); 0 or less: it is folded.
+
+    Taken at corners, mid-edge nodes and the points of both rules of integration of `tetopt.geometry.quadratic`.
+    """
+    n = mesh.ndim
+    nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
+    corners = np.eye(n + 1)
+    middles = corners[cell_edges(n)].mean(axis=1)
+    places = np.concatenate([corners, middles, gauss_rule(n, 2)[0], curved_rule(n)[0]])
+    return jacobian_ratios(nodes, cells, places).min(axis=1)
+
+
+def _problems_of_curves(mesh: Mesh) -> list[str]:
+    if mesh.midpoints is None or not len(cells := np.flatnonzero(scaled_jacobians(mesh) <= 0.0)):
+        return []
+    return [f"quadratic cells folded by their mid-edge nodes: {_first(cells)}"]
 
 
 def _problems_of_facets(mesh: Mesh) -> list[str]:

@@ -1,22 +1,42 @@
 """Cells of order 1 and 2: nodes, shape functions, rules of integration.
 
 Order 1 has a node at each corner and displacements that are linear in a cell; order 2 also one in the middle of each
-edge, and quadratic displacements. Edges are straight, so that a cell of either order is the same simplex.
+edge, and quadratic displacements. Edges are straight, so that a cell of either order is the same simplex, unless their
+midpoints are given: such cells are isoparametric, and the shape functions map the straight cell onto the curved one.
 Places within a cell are barycentric, (K, n+1). See Zienkiewicz and Taylor, The Finite Element Method, volume 1,
 chapters 4 (shape functions) and 5 (integration).
 """
 
 from __future__ import annotations
 
+from itertools import permutations, product
+from math import factorial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import outward_facet_nodes
+from tetopt.geometry.simplex import determinants, outward_facet_nodes, volume_gradients, volumes
 
 # Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and FEBio; the first
 # three are a triangle's, nodes 3 to 5.
 QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+CURVED_POINTS = {7: 2, 14: 3}  # of `curved_rule`: dimension by number
+ROOT_OF_15 = 15.0**0.5  # in the coordinates and weights of Radon's rule and Gauss's
+# Of `curved_rule` by dimension: points, each for all distinct permutations of its coordinates, and their weights.
+CURVED_ORBITS: dict[int, list[tuple[tuple[float, ...], float]]] = {
+    1: [((0.5, 0.5), 4.0 / 9.0), ((0.5 + 0.1 * ROOT_OF_15, 0.5 - 0.1 * ROOT_OF_15), 5.0 / 18.0)],
+    2: [
+        ((1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0), 0.225),
+        (((9.0 + 2.0 * ROOT_OF_15) / 21.0, *((6.0 - ROOT_OF_15) / 21.0,) * 2), (155.0 - ROOT_OF_15) / 1200.0),
+        (((9.0 - 2.0 * ROOT_OF_15) / 21.0, *((6.0 + ROOT_OF_15) / 21.0,) * 2), (155.0 + ROOT_OF_15) / 1200.0),
+    ],
+    3: [
+        ((0.72179424906732632079, *(0.09273525031089122640,) * 3), 0.07349304311636194934),
+        ((0.06734224221009817060, *(0.31088591926330060980,) * 3), 0.11268792571801585080),
+        ((*(0.45449629587435035051,) * 2, *(0.04550370412564964949,) * 2), 0.04254602077708146644),
+    ],
+}
 
 
 def cell_edges(n: int) -> NDArray[np.int64]:
@@ -38,24 +58,27 @@ def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
     return np.column_stack(np.divmod(keys, n_nodes)), number.reshape(len(cells), -1)
 
 
-def quadratic(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def quadratic(
+    points: NDArray[np.float64], cells: NDArray[np.int64], midpoints: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Nodes (N + E, n) and cells (M, 6 or 10) of order 2, of points (N, n) and cells (M, n+1).
 
-    The points come first, then the midpoints of the edges, which are sorted by their ends; a cell's corners come first,
-    then the midpoints of `cell_edges`.
+    The points come first, then the midpoints (E, n) of the edges, which are sorted by their ends, by default those of
+    straight ones; a cell's corners come first, then the midpoints of `cell_edges`.
     """
     edges, number = numbered_edges(cells)
-    midpoints = points[edges].mean(axis=1)
+    if midpoints is None:
+        midpoints = points[edges].mean(axis=1)
     return np.concatenate([points, midpoints]), np.column_stack([cells, len(points) + number])
 
 
 def of_order(
-    points: NDArray[np.float64], cells: NDArray[np.int64], order: int
+    points: NDArray[np.float64], cells: NDArray[np.int64], order: int, midpoints: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Nodes and cells of order 1, which are the points and cells themselves, or 2; InputError for another order."""
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
-    return (points, cells) if order == 1 else quadratic(points, cells)
+    return (points, cells) if order == 1 else quadratic(points, cells, midpoints)
 
 
 def node_count(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
@@ -110,15 +133,83 @@ def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]
     return slopes
 
 
-def gauss_rule(n: int, order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gauss_rule(n: int, order: int, is_curved: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (Q, n+1) and weights (Q,), which sum to 1, of the rule that integrates a cell's stiffness.
 
     One point for order 1; n + 1 for order 2, exact for polynomials of degree 2, which the product of two strains is.
-    Point k lies nearest to corner k.
+    Point k lies nearest to corner k. Curved cells of order 2 take `curved_rule`.
     """
+    if is_curved and order == 2:
+        return curved_rule(n)
     if order == 1:
         return np.full((1, n + 1), 1.0 / (n + 1)), np.ones(1)
     near = (5.0 - np.sqrt(5.0)) / 20.0 if n == 3 else 1.0 / 6.0
     places = np.full((n + 1, n + 1), near)
     np.fill_diagonal(places, 1.0 - n * near)
     return places, np.full(n + 1, 1.0 / (n + 1))
+
+
+def curved_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (Q, n+1) and weights (Q,), which sum to 1, of a rule of degree 5 with 3, 7 or 14 points.
+
+    It integrates exactly what mid-edge nodes add: a curved tetrahedron's volume is an integral of degree 3, its weight
+    on a node of degree 5, the pull of a uniform stress on a node of degree 3, so that patch tests hold. The rules are
+    Gauss's, Radon's (Monatshefte fuer Mathematik 52, 1948, 286-300) and Walkington's (Carnegie Mellon University,
+    research report 00-CNA-023, 2000).
+    """
+    places = [
+        (place, weight)
+        for point, weight in CURVED_ORBITS[n]
+        for place in sorted(set(permutations(point)), reverse=True)
+    ]
+    return np.array([place for place, _ in places]), np.array([weight for _, weight in places])
+
+
+def on_curved_rule(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (M, n+1) of the parts of cells nearest to each corner at the points of `curved_rule`, (M, Q).
+
+    A point as near to several corners as to one has the mean of theirs.
+    """
+    places = curved_rule(values.shape[1] - 1)[0]
+    is_nearest = places == places.max(axis=1, keepdims=True)
+    return np.einsum("qa,ca->cq", is_nearest / is_nearest.sum(axis=1, keepdims=True), values)
+
+
+def jacobian_ratios(
+    nodes: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Jacobian determinants of quadratic cells (M, 6 or 10) at places (K, n+1), over the straight cells', (M, K).
+
+    The volume of what is around a place over that in the cell with the same corners and straight edges: 1 everywhere
+    in a straight cell; where it is 0 or less, the cell is folded and no solver takes it.
+    """
+    corners = cells[:, : places.shape[1]]
+    gradients = volume_gradients(nodes, corners) / volumes(nodes, corners)[:, None, None]
+    maps = (mapped_slopes(nodes[cells], slopes @ gradients) for slopes in shape_slopes(places, 2))
+    return np.stack([determinants(each) for each in maps], axis=1)
+
+
+def mapped_slopes(nodes: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives (M, n, n) of the map from straight to curved cells, of nodes and gradients (M, A, n) there."""
+    return np.einsum("cai,caj->cij", nodes, gradients)
+
+
+def jacobian_bounds(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """A lower bound (M,) of `jacobian_ratios` anywhere in quadratic cells (M, 6 or 10).
+
+    The determinant is a polynomial of degree n, never below the least of its Bernstein coefficients: where these are
+    positive, the cell is nowhere folded (Johnen, Remacle and Geuzaine 2013, J. Comput. Phys. 233, 359-372).
+    """
+    n = nodes.shape[1]
+    corners, edges = nodes[cells[:, : n + 1]], cell_edges(n)
+    controls = np.empty((len(cells), n + 1, n + 1, n))  # of the cell as a Bezier one, by pairs of corners
+    controls[:, range(n + 1), range(n + 1)] = corners
+    middles = 2.0 * nodes[cells[:, n + 1 :]] - 0.5 * (corners[:, edges[:, 0]] + corners[:, edges[:, 1]])
+    controls[:, edges[:, 0], edges[:, 1]] = controls[:, edges[:, 1], edges[:, 0]] = middles
+    arms = 2.0 * (controls[:, 1:] - controls[:, :1])  # (M, n, n+1, n): slopes from corner 0, linear in the cell
+    sums: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+    for of_arm in product(range(n + 1), repeat=n):
+        frames = np.stack([arms[:, axis, k] for axis, k in enumerate(of_arm)], axis=1)
+        sums.setdefault(tuple(sorted(of_arm)), []).append(determinants(frames))
+    least = np.min([np.mean(terms, axis=0) for terms in sums.values()], axis=0)
+    return np.asarray(least / (factorial(n) * volumes(nodes, cells[:, : n + 1])))

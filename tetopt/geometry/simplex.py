@@ -36,10 +36,10 @@ def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
     corners = points[cells]
     frames = corners[:, 1:] - corners[:, :1]
-    return _determinants(frames) / factorial(points.shape[1])
+    return determinants(frames) / factorial(points.shape[1])
 
 
-def _determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal, unlike an LU's."""
     if frames.shape[1] == 2:
         return frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]

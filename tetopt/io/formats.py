@@ -202,7 +202,7 @@ def save_mesh(
     point_data : dict of arrays, optional
         By name, a row for each mesh point, or each node of order 2.
     order : {1, 2}
-        2: straight-edged quadratic cells.
+        2: quadratic cells, of straight edges unless the mesh has midpoints.
 
     Raises
     ------

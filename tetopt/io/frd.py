@@ -194,7 +194,7 @@ def _checked_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) 
     """Order of the cells and convention of the axes; InputError if the mesh is another one."""
     if mesh.ndim != 3:
         raise InputError(f"{path}: expected a mesh of tetrahedra beside CalculiX's results, got one of triangles")
-    nodes_of_order = {1: (mesh.points, mesh.cells), 2: quadratic(mesh.points, mesh.cells)}
+    nodes_of_order = {1: (mesh.points, mesh.cells), 2: quadratic(mesh.points, mesh.cells, mesh.midpoints)}
     order = next((k for k, (points, _) in nodes_of_order.items() if len(points) == len(grid.points)), None)
     if order is None or sum(map(len, grid.cells)) != len(mesh.cells):
         raise InputError(

@@ -73,11 +73,11 @@ def load_mesh(path: str | Path) -> MeshFile:
         n = CELL_DIMENSIONS[kind]
         points = half_turn(raw.points) if n == 3 and raw.space == "lps" else raw.points
         picked = simplices_of(points, raw.cells[kind], raw.middles.get(kind))
-        mesh = Mesh(picked.points, picked.cells)
+        middles, is_curved, of_edges = _middles(raw, kind)
+        mesh = Mesh(picked.points, picked.cells, points[middles, :n] if is_curved else None)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     used = picked.used
-    middles, of_edges = _middles(raw, kind)
     sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
     shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which only tell the sets again
     at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
@@ -98,11 +98,11 @@ def load_mesh(path: str | Path) -> MeshFile:
     )
 
 
-def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """The nodes (E,) on the edges of cells of order 2, in the order of `quadratic`, none of order 1; and in words
-    which edges are not straight in the file."""
+def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], bool, tuple[str, ...]]:
+    """The nodes (E,) on the edges of cells of order 2, in the order of `quadratic`, none of order 1; whether one of the
+    edges is curved; and in words how many are, and which middle nodes are left out."""
     if kind not in raw.middles:
-        return np.empty(0, dtype=np.int64), ()
+        return np.empty(0, dtype=np.int64), False, ()
     edges, number = numbered_edges(raw.cells[kind])
     nodes, notes = np.empty(len(edges), dtype=np.int64), []
     nodes[number] = raw.middles[kind]
@@ -114,10 +114,8 @@ def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     if (raw.points.astype(np.float32) == raw.points).all():  # a file in single precision, which rounds midpoints
         straight += np.finfo(np.float32).eps * np.abs(raw.points).max()
     if n_curved := int((~(off <= straight)).sum()):
-        notes.append(
-            f"{n_curved} of {len(edges)} edges are curved, by {off.max():.2g} mm at most: they are made straight"
-        )
-    return nodes, tuple(notes)
+        notes.append(f"{n_curved} of {len(edges)} edges are curved, by up to {off.max():.2g} mm")
+    return nodes, n_curved > 0, tuple(notes)
 
 
 def _numbers(

@@ -8,7 +8,7 @@ one that two sets hold from opposite sides is turned as in the first of them.
 
 A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as `Mesh::SetCurvature(2)` makes one: vertices,
 then the middles of edges in the order in which the elements first name them. MFEM takes elements with such a function
-for curved ones; these are straight.
+for curved ones, which those on interfaces may be.
 
 The comments at the head tell coordinates, units, each material's constants and attributes, and the loads.
 `mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` marks where a condition holds.
@@ -75,8 +75,9 @@ def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64])
 def _nodes(mesh: Mesh) -> str:
     """The function of the nodes of order 2, node by node."""
     ends = np.sort(mesh.cells[:, ELEMENT_EDGES[mesh.ndim]], axis=2).reshape(-1, 2)
-    _, first = np.unique(ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True)
-    middles = mesh.points[ends[np.sort(first)]].mean(axis=1)
+    _, first, number = np.unique(ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True, return_inverse=True)
+    straight = mesh.points[ends[np.sort(first)]].mean(axis=1)
+    middles = straight if mesh.midpoints is None else mesh.midpoints[number.ravel()[np.sort(first)]]
     head = f"FiniteElementSpace\nFiniteElementCollection: H1_{mesh.ndim}D_P2\nVDim: {mesh.ndim}\nOrdering: 1\n"
     return f"\nnodes\n{head}\n{rows(np.concatenate([mesh.points, middles]))}"
 

@@ -40,8 +40,8 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This reads all of it, o
 Before 0.7 `fem.functionspace` was `fem.FunctionSpace`; with that, 0.5.2 runs it, too. `read_meshtags` takes the first
 attribute of a grid, which `material` is for that reason. The encoding must be given, or dolfinx looks for an HDF5 file
 beside this one. It reads no floating point numbers of cells from XDMF, hence the parsing. Quadratic elements are chosen
-there, on cells of either order: a file of order 2 has the nodes of order 2, too, of cells that are as straight, which
-dolfinx integrates as if they were curved.
+there, on cells of either order: a file of order 2 has the nodes of order 2, too, of cells that dolfinx integrates as
+curved ones, which those on interfaces may be.
 
 In the grid "mesh" <Information Name="young"> and <Information Name="nu"> list what the materials 1, 2, ... have,
 <Information Name="load" Value="hold:superior"> is a load in the words of `tetopt.model.loads`, and

@@ -12,7 +12,7 @@ from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
-from tetopt.geometry.check import check_mesh, manifold_problems
+from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
 from tetopt.job.inputs import label_table, read_companion, read_mesh, table_in, warn_of_other_image
@@ -112,6 +112,8 @@ def judge(
     loaded = read_mesh(mesh)
     shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
+    if loaded.mesh.midpoints is not None:
+        numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
         judgement = judgement._replace(source=_source(loaded, image, mask, labels, part))

@@ -37,6 +37,7 @@ from tetopt.job.write import model_with
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
+from tetopt.report.tables import curving_in_words
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.system.files import check_space
 
@@ -85,6 +86,10 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
         start=None if task.started is None else task.started.mesh, spacing=job.spacing, kind=kind, sizes=task.sizes,
         order=task.plan.order, watch=watch, **options,
     )  # fmt: skip
+    if result.curving is not None:
+        note(curving_in_words(result.curving))
+    elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
+        note("`start`: its curved edges become straight, as neither labels nor a mask say where their nodes belong")
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))

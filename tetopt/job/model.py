@@ -310,7 +310,8 @@ def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Pa
     """Keep an optimised mesh beside its file until that is written, whatever may end the process before; the place."""
     early = next(kept_places(output, ".vtu"))
     try:
-        save_mesh(early, mesh, {} if labels is None else {"label": labels})
+        data = {} if labels is None else {"label": labels}
+        save_mesh(early, mesh, data, order=1 if mesh.midpoints is None else 2)
     except (OSError, MemoryError) as error:
         note(f"the optimised mesh cannot be kept before its file is written: {error_words(error)}")
         return None

@@ -341,7 +341,12 @@ class ModelOptions:
     ] = None
     label_names: LabelNamesOption = None
     order: Annotated[
-        int | None, Option("1|2", "2: quadratic cells, straight-edged; 1: linear. By default as the mesh read, else 1.")
+        int | None,
+        Option(
+            "1|2",
+            "2: quadratic cells, whose edges a run with labels or a mask curves along their surfaces; 1: linear. By "
+            "default as the mesh read, else 1.",
+        ),
     ] = None
 
 

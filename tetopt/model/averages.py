@@ -213,7 +213,7 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
 
     Linear between a cell's corners, as Abaqus and CalculiX have moduli that depend on a nodal temperature.
     """
-    places, _ = gauss_rule(mesh.ndim, order)
+    places, _ = gauss_rule(mesh.ndim, order, mesh.midpoints is not None)
     corners = node_young[mesh.cells]
     # Within their range, so that equal moduli stay as they are.
     low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)

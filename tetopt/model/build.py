@@ -82,7 +82,8 @@ def build_model(
     spacing : {"equal", "quantile", "log"}
         How the bins divide the moduli.
     order : {1, 2}, optional
-        By default the file's, or 1. 2: straight-edged quadratic cells in the file, where a format has them.
+        By default the file's, or 1. 2: quadratic cells in the file, where a format has them, of straight edges unless
+        the mesh has midpoints, as `mesh_image` with order 2 makes them on interfaces and on a mask's surface.
     cell_data : dict, optional
         What is known of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields`, and what the
         file has.

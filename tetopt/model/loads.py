@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.geometry.quadratic import (
+    curved_rule,
+    quadratic,
+    quadratic_facet_nodes,
+    shape_slopes,
+    shape_values,
+)
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
@@ -302,8 +308,12 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
     order : {1, 2}
         Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D a facet's area A then goes to the
         midpoints of its edges, A/3 each, and nothing to its corners; in 2-D an edge's length is shared as Simpson's
-        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same part.
+        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same part. Curved facets are
+        integrated by `tetopt.geometry.quadratic.curved_rule`.
     """
+    if order == 2 and mesh.midpoints is not None:
+        nodes, shapes, normals = _curved_facets(mesh, rows)
+        return nodes, np.einsum("qa,qk->ka", shapes, np.sqrt((normals**2).sum(axis=2)))
     areas = np.sqrt((area_vectors(mesh, rows) ** 2).sum(axis=1))
     if order == 1:
         nodes = facet_triples(mesh.cells, rows)
@@ -314,12 +324,30 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
     return nodes, areas[:, None] * fractions
 
 
+def _curved_facets(
+    mesh: Mesh, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes (K, w) of curved facets of order 2, shape functions (Q, w) at the points of a rule, and outward normals
+    there as long as the part of the facet (in 2-D of the edge) that a point stands for, (Q, K, n)."""
+    points, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
+    nodes = quadratic_facet_nodes(cells, rows)
+    places, weights = curved_rule(mesh.ndim - 1)
+    normals = np.empty((len(places), len(rows), mesh.ndim))
+    for q, (slopes, weight) in enumerate(zip(shape_slopes(places, 2), weights, strict=True)):
+        arms = np.einsum("ab,kai->bki", slopes[:, 1:] - slopes[:, :1], points[nodes])
+        normals[q] = weight * (0.5 * np.cross(*arms) if mesh.ndim == 3 else arms[0, :, ::-1] * (1.0, -1.0))
+    return nodes, shape_values(places, 2), normals
+
+
 def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """What a pressure or traction does to nodes: their numbers (P,), ascending, and forces (P, n), mN if it is in kPa.
 
     Nodes whose part is 0 are left out.
     """
     rows = sets.facets[load.set_name]
+    if load.kind == "pressure" and order == 2 and mesh.midpoints is not None:
+        nodes, shapes, normals = _curved_facets(mesh, rows)
+        return _summed(nodes.ravel(), -load.numbers * np.einsum("qa,qki->kai", shapes, normals).reshape(-1, mesh.ndim))
     nodes, weights = facet_weights(mesh, rows, order)
     if load.kind == "pressure":
         areas = area_vectors(mesh, rows)

@@ -71,7 +71,7 @@ class Model(NamedTuple):
     loads : tuple of Load
         Supports, displacements, pressures, tractions, springs, gravity.
     order : {1, 2}
-        2: straight-edged quadratic cells, see `tetopt.geometry.quadratic`.
+        2: quadratic cells, of straight edges unless the mesh has midpoints, see `tetopt.geometry.quadratic`.
     units : {"kPa", "MPa"}
         Of moduli and pressures.
     space : {"ras", "lps"}
@@ -215,7 +215,8 @@ def in_space(model: Model, space: str) -> Model:
     if model.mesh.ndim == 2:
         raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out `space`")
     loads = tuple(half_turned(load) for load in model.loads)
-    mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells)
+    middles = None if model.mesh.midpoints is None else half_turn(model.mesh.midpoints)
+    mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells, middles)
     cell_data, point_data = (half_turned_fields(each) for each in (model.cell_data, model.point_data))
     return model._replace(mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data)
 
@@ -318,7 +319,7 @@ def described(model: Model) -> list[str]:
 
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
-    return of_order(model.mesh.points, model.mesh.cells, model.order)
+    return of_order(model.mesh.points, model.mesh.cells, model.order, model.mesh.midpoints)
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:

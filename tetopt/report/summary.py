@@ -35,9 +35,11 @@ def versions() -> dict[str, str]:
 
 
 def mesh_hash(mesh: Mesh) -> str:
-    """SHA-256 over the bytes of points and cells: equal for meshes that are the same to the last bit."""
+    """SHA-256 over the bytes of points, cells and midpoints, if any: equal for meshes of the same bits."""
     digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
     digest.update(np.ascontiguousarray(mesh.cells).tobytes())
+    if mesh.midpoints is not None:
+        digest.update(mesh.midpoints.tobytes())
     return digest.hexdigest()
 
 
@@ -89,6 +91,7 @@ def run_summary(
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
         "violated": dict(result.violated),
+        **({} if result.curving is None else {"curving": result.curving}),
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from tetopt.engine.curving import Curving
 from tetopt.geometry.quadratic import node_count
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
@@ -39,8 +40,9 @@ def nodes_in_words(mesh: Mesh, order: int) -> str:
     return f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, order)} in all"
 
 
-def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> None:
-    """Rows of the shape of one or several meshes, a column each; `in_all` are their nodes where cells are quadratic."""
+def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None) -> None:
+    """Rows of the shape of one or several meshes, a column each; `in_all` are their nodes where cells are quadratic,
+    `jacobian` the smallest scaled Jacobian determinant of curved ones."""
     corners = [str(q.n_nodes) for q in meshes]
     table.add_row("corner nodes" if in_all else "nodes", *corners)
     if in_all:
@@ -64,6 +66,8 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> N
     ]
     for name, text in rows:
         table.add_row(name, *(text(q) for q in meshes))
+    if jacobian is not None:
+        table.add_row("scaled Jacobian of curved cells, smallest", f"{jacobian:.4f}")
 
 
 def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
@@ -93,6 +97,15 @@ def sizes_in_words(edges: EdgeRatios) -> str:
         f"edges over their target size: {edges.mean:.2f} in the mean; {edges.below:.1%} under "
         f"{SHORT_EDGE_FRACTION:.2f}, "
         f"where the image asks for smaller cells; {edges.above:.1%} over {LONG_EDGE:.2f}"
+    )
+
+
+def curving_in_words(curving: Curving) -> str:
+    """How many edges on interfaces and on a mask's surface are curved, in one line."""
+    return (
+        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node there, "
+        f"{curving.n_part_way} go part of the way and {curving.n_straight} are straight; up to "
+        f"{curving.farthest:.2g} mm off the straight edge, scaled Jacobian at least {curving.least_jacobian:.2f}"
     )
 
 
