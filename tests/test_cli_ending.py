@@ -318,6 +318,8 @@ MEASURES = {  # where each is called, and its keys in run.json
     "mask_fidelity": (tetopt.report.summary, {"mask"}),
     "label_fidelity": (tetopt.report.summary, {"labels"}),
     "label_interfaces": (tetopt.report.summary, {"interfaces"}),
+    "label_contacts": (tetopt.report.summary, {"contacts"}),
+    "label_thickness": (tetopt.report.summary, {"thickness"}),
     "by_contrast": (tetopt.job.source.Source, {"contrasts"}),
     "fields": (tetopt.job.source.Source, {"cells_without_voxel"}),
 }
