@@ -158,6 +158,8 @@ def test_tables_have_the_worst_five_alone():
     worst = sorted(rows, key=lambda row: -row.one_layer_fraction)[:5]
     assert [int(row[0].split()[0]) for row in shown] == [row.label for row in worst]
     assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "1.00", "2.00", "3.00", "-", "-", "-")
+    alike = [row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)) for row in rows]
+    assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
     contacts = [LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)]
     contacts += [LabelContact((2, 3), 90.0, 0.0, np.nan), LabelContact((2, 4), 149.0, 100.0, 1.49)]
     shown = texts(contact_table(contacts, {3: "fluid"}, 2))

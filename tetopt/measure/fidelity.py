@@ -44,7 +44,18 @@ class FacetSurface(NamedTuple):
 
 
 class Thickness(NamedTuple):
-    """Percentiles of a label's local thickness over its voxels' centres, mm (`tetopt.label_thickness`)."""
+    """Percentiles of a label's local thickness, by `tetopt.label_thickness`.
+
+    Parameters
+    ----------
+    p5, p50, p95 : float
+        The 5th percentile, the median and the 95th, over the voxels' centres in the label, mm.
+
+    Examples
+    --------
+    >>> tetopt.Thickness(1.0, 1.5, 2.5).p50
+    1.5
+    """
 
     p5: float
     p50: float

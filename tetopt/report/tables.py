@@ -129,12 +129,16 @@ def _decimals(number: float, count: int) -> str:
 
 
 def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
-    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, and how thick they are."""
+    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, of equal ones the thinnest."""
     table = new_table(
         "thin labels", "in one layer, %", "voxels, mm: 5 %", "50 %", "95 %", "cells, mm: 5 %", "50 %", "95 %"
     )
     there = [row for row in rows if row.n_cells]
-    for row in sorted(there, key=lambda row: (-row.one_layer_fraction, row.label))[:WORST_ROWS]:
+
+    def goodness(row: LabelFidelity) -> tuple[float, float, int]:
+        return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label
+
+    for row in sorted(there, key=goodness)[:WORST_ROWS]:
         thickness = [text for each in (row.thickness_voxels, row.thickness_mesh) for text in _percentile_texts(each)]
         table.add_row(_label_words(row.label, names), _decimals(100.0 * row.one_layer_fraction, 1), *thickness)
     return table
