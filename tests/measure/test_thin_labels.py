@@ -66,7 +66,7 @@ def test_contact_that_the_voxels_do_not_have():
 
 def test_only_voxels_in_the_mask_touch():
     labels = slabs(3)
-    mask = tetopt.Image(np.indices(labels.shape)[0] < 10)
+    mask = tetopt.Image(np.indices(labels.shape)[0] < 11)
     image, mesh, of_cell = blocky(labels)
     assert [each.labels for each in label_contacts(image, mesh, of_cell, mask) if each.voxels_mm2] == [(1, 2)]
     with pytest.raises(tetopt.InputError, match=r"mask: expected the shape of labels"):
@@ -117,6 +117,14 @@ def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
     voxels, cells = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
     assert cells == pytest.approx((size,) * 3, abs=1e-4)
     assert voxels == pytest.approx(cells, rel=0.03)
+
+
+def test_percentiles_are_over_the_voxels():
+    x, y = np.indices((20, 20))
+    size = np.choose(np.searchsorted([6, 16], y, side="right"), [2, 4, 6])
+    image, mesh, of_cell = blocky(np.where((x >= 6) & (x < 6 + size), 2, 1))
+    for each in label_thickness(tetopt.content(image, image), mesh, of_cell)[2]:
+        assert each == pytest.approx((2.0, 4.0, 6.0), abs=0.5)
 
 
 def test_a_label_that_is_in_one_of_them_alone():
