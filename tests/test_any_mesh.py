@@ -115,9 +115,13 @@ WITH_IMAGE = {
     "cell_moments": tetopt.cell_moments,
     "cell_of_voxel": tetopt.cell_of_voxel,
     "check_mesh": lambda image, mesh: tetopt.check_mesh(mesh, image),
+    "label_contacts": lambda image, mesh: tetopt.label_contacts(labels_of(image), mesh, np.arange(len(mesh.cells)) % 2),
     "label_fidelity": lambda image, mesh: tetopt.label_fidelity(labels_of(image), mesh),
     "label_interfaces": lambda image, mesh: tetopt.label_interfaces(
         labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
+    ),
+    "label_thickness": lambda image, mesh: tetopt.label_thickness(
+        tetopt.content(image, labels_of(image)), mesh, np.arange(len(mesh.cells)) % 2
     ),
     "mask_fidelity": lambda image, mesh: tetopt.mask_fidelity(labels_of(image), mesh),
     "mesh_image": lambda image, mesh: tetopt.mesh_image(image, start=mesh, iterations=1),

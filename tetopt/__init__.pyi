@@ -44,6 +44,7 @@ from .job.task import Meshed as Meshed, Task as Task
 from .measure.fidelity import (
     LabelFidelity as LabelFidelity,
     MaskFidelity as MaskFidelity,
+    Thickness as Thickness,
     cell_labels as cell_labels,
     label_fidelity as label_fidelity,
     mask_fidelity as mask_fidelity,
@@ -51,6 +52,11 @@ from .measure.fidelity import (
 from .measure.interfaces import LabelInterface as LabelInterface, label_interfaces as label_interfaces
 from .measure.quality import Quality as Quality, QualityErrors as QualityErrors, quality as quality
 from .measure.segmentation import segment as segment
+from .measure.thin import (
+    LabelContact as LabelContact,
+    label_contacts as label_contacts,
+    label_thickness as label_thickness,
+)
 from .mesh import Mesh as Mesh
 from .model.build import build_model as build_model
 from .model.fields import cell_fields as cell_fields

@@ -187,6 +187,20 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> N
         print_wide(label_table(rows, interfaces, names, ndim))
         for line in label_differences(rows, interfaces, names):
             out.print(escape(line))
+    _print_thin(measured, ndim)
+
+
+def _print_thin(measured: dict[str, Any], ndim: int) -> None:
+    """The thinnest labels in cells, and contact of labels that is too large."""
+    from tetopt.report.tables import contact_table, contacts_in_words, thin_table
+
+    names = measured.get("label_names", {})
+    if "labels" in measured:
+        print_wide(thin_table(measured["labels"], names))
+    if "contacts" in measured:
+        if (table := contact_table(measured["contacts"], names, ndim)) is not None:
+            print_wide(table)
+        out.print(escape(contacts_in_words(measured["contact_totals"], ndim)))
 
 
 def print_wide(table: Table) -> None:

@@ -7,7 +7,16 @@ import time
 import numpy as np
 from rich.markup import escape
 
-from tetopt import Image, InputError, cell_fields, label_fidelity, mask_fidelity, mesh_image
+from tetopt import (
+    Image,
+    InputError,
+    cell_fields,
+    cell_labels,
+    label_fidelity,
+    label_thickness,
+    mask_fidelity,
+    mesh_image,
+)
 from tetopt.cli.console import out
 from tetopt.cli.run import compiling
 from tetopt.contents.content import content
@@ -44,7 +53,9 @@ def _mesh_balls(n: int) -> None:
     mesh_image(balls, nodes, mode="paper", iterations=2)
     inside = Image((radius < 0.45 * BALL_VOXELS).astype(float))
     mesh_image(content(balls, mask=inside), nodes, mode="uniform", iterations=2)
-    mesh = mesh_image(content(balls, labels=balls), nodes, iterations=4).mesh
+    what = content(balls, labels=balls)
+    mesh = mesh_image(what, nodes, iterations=4).mesh
     cell_fields(mesh, balls)
     label_fidelity(balls, mesh)
+    label_thickness(what, mesh, cell_labels(balls, mesh))
     mask_fidelity(inside, mesh)

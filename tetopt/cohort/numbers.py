@@ -34,11 +34,12 @@ from tetopt.system.incoming import toml_of
 
 Status = Literal["done", "violated", "failed", "missing"]
 Value = float | int | str | bool | None
-# Of run.json, not in the table: rows by iteration; sizes of sets, of which those of labels are in `labels`; names and
-# loads in words; what has columns by other names; the sentences that `reason` has.
+# Of run.json, not in the table: rows by iteration; sizes of sets, of which those of labels are in `labels`; pairs of
+# labels, of which there are sums; names and loads in words; what has columns by other names; the sentences that
+# `reason` has.
 UNLISTED_NUMBERS = (
     "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "violated",
-    "interfaces", "labels", "request",
+    "interfaces", "labels", "contacts", "thickness", "request",
 )  # fmt: skip
 SHORT_LIST = 4  # numbers of a list that have columns of their own: spacings, sides; more are moduli by the hundred
 NOT_AVAILABLE = "n/a"  # as BIDS writes a value that there is none of

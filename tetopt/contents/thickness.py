@@ -3,12 +3,14 @@
 The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67), between the smooth surfaces of labels
 (`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5 voxels has 1.5, where distances of voxels'
 centres would give 1 or 2. At a voxel in the middle of its label the diameter is the shortest of the 13 chords
-through it along axes and diagonals, each of which ends where another label's level is as small.
+through it along axes and diagonals, each of which ends where another label's level is as small. Between facets it is
+the same, but that a chord ends where it crosses one.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -17,21 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.memberships import Memberships
+from tetopt.geometry.vectors import cross, dot, minus, row, scaled
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
-THICKNESS_BYTES = 16.0  # at each voxel: chords, thickness, the labels within a region
+THICKNESS_BYTES = 18.0  # at each voxel: chords, thickness, the labels, also those within a region
 BEYOND_REGION = -1  # in place of a label: beyond the region
 SLABS_PER_THREAD = 4  # of the grid for each thread: some take longer than others
+NO_CROSSING = 255  # of a step that no facet crosses
+BESIDE_FRACTION = 1e-9  # of a triangle's size: so far beside it counts as in it
 OFF_MIDDLE_STEPS = 1.01  # by which the two ways along the shortest chord through a middle differ at most
 
 
 class _Labels(NamedTuple):
     """Labels on a grid, as kernels take them."""
 
-    partition: NDArray[np.int64]  # (s_0, s_1, s_2) row of the label; -1 beyond the region
+    partition: NDArray[np.int16]  # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to stay in caches
     levels: NDArray[np.float32]  # (C, s_0, s_1, s_2)
     channel: NDArray[np.int64]  # (K,)
+    crossing: NDArray[np.uint8]  # (D, s_0, s_1, s_2) where facets cross each step up, 0 to 254; or without levels only
 
 
 def local_thickness(
@@ -60,23 +66,77 @@ def local_thickness(
     InputError
         There is no memory for it.
     """
-    shape, n = members.partition.shape, members.partition.ndim
     check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
-    whole = (1,) * (3 - n) + shape
     partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
-    labels = _Labels(
-        np.ascontiguousarray(partition.reshape(whole)), members.levels.reshape(-1, *whole), members.channel
-    )
+    whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
+    no_crossing = np.zeros((0, 1, 1, 1), dtype=np.uint8)
+    levels = members.levels.reshape(-1, *whole)
+    return _thickness(partition, levels, members.channel, no_crossing, spacing, most)
+
+
+def thickness_between(
+    corners: NDArray[np.float64], partition: NDArray[np.int64], spacing: NDArray[np.float64], most: float
+) -> NDArray[np.float32]:
+    """Local thickness of labels whose surfaces are facets, such as those of a mesh.
+
+    Parameters
+    ----------
+    corners : (F, n, n) float64
+        Of each facet between two labels its nodes, mm from the centre of the first voxel, along the grid's axes.
+    partition : (s_0, ..., s_{n-1}) int64
+        Which label each voxel's centre has, any whole number from 0; -1 beyond the region.
+    spacing : (n,) float64
+        Edges of the voxels, mm.
+    most : float
+        Larger values are cut off at this one, mm.
+
+    Returns
+    -------
+    (s_0, ..., s_{n-1}) float32
+        mm; 0 beyond the region.
+
+    Raises
+    ------
+    InputError
+        Not enough memory.
+    """
+    shape, n = partition.shape, partition.ndim
+    whole = (1,) * (3 - n) + shape
+    (steps, _), edges = _rays(spacing)
+    check_memory((THICKNESS_BYTES + len(steps)) * partition.size, "thickness of labels", "crop the image")
+    if n == 2:  # a segment is a rectangle across the plane, of two triangles
+        flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
+        flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and the second
+        corners = np.concatenate([flat[:, :3], flat[:, 1:]])
+    crossing = np.full((len(steps), *whole), NO_CROSSING, dtype=np.uint8)
+    _over_slabs(lambda slab: _fill_crossings(crossing, corners, steps * edges, edges, slab[3 - n], 3 - n), whole, n)
+    no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
+    return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), crossing, spacing, most)
+
+
+def _thickness(
+    partition: NDArray[np.int64], levels: NDArray[np.float32], channel: NDArray[np.int64],
+    crossing: NDArray[np.uint8], spacing: NDArray[np.float64], most: float,
+) -> NDArray[np.float32]:  # fmt: skip
+    """`local_thickness` of labels by row, -1 beyond the region, between levels or crossings on a grid in space."""
+    n = partition.ndim
+    whole = (1,) * (3 - n) + partition.shape
+    labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, crossing)
     rays, edges = _rays(spacing)
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
+    _over_slabs(lambda slab: _fill_chords(chord, is_middle, labels, rays, most, slab), whole, n)
+    thickness = chord.copy()
+    _spread_balls(thickness, chord, is_middle, labels.partition, edges)
+    return thickness.reshape(partition.shape)
+
+
+def _over_slabs(fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tuple[int, ...], n: int) -> None:
+    """Call a function of slabs of a grid, each of which is written to by one call, on all threads."""
     ends = np.linspace(0, whole[3 - n], SLABS_PER_THREAD * numba.get_num_threads() + 1).astype(int).tolist()
     box = [(0, size) for size in whole]
     slabs = [(*box[: 3 - n], ends_of, *box[4 - n :]) for ends_of in itertools.pairwise(ends)]
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        list(threads.map(lambda slab: _fill_chords(chord, is_middle, labels, rays, most, slab), slabs))
-    thickness = chord.copy()
-    _spread_balls(thickness, chord, is_middle, labels.partition, edges)
-    return thickness.reshape(shape)
+        list(threads.map(fill, slabs))
 
 
 def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
@@ -101,31 +161,42 @@ def _fill_chords(
                     continue
                 least, off_middle = most, np.inf
                 for d in range(len(steps)):
-                    forth = _way(labels, (i, j, k), steps[d], lengths[d], least)
+                    forth = _way(labels, (i, j, k), (d, steps[d]), lengths[d], least)
                     if forth >= least:
                         continue
-                    back = _way(labels, (i, j, k), -steps[d], lengths[d], least - forth)
+                    back = _way(labels, (i, j, k), (-1 - d, -steps[d]), lengths[d], least - forth)
                     if forth + back < least:
                         least, off_middle = forth + back, abs(forth - back) / lengths[d]
                 chord[i, j, k] = least
                 is_middle[i, j, k] = off_middle <= OFF_MIDDLE_STEPS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _way(labels: _Labels, place: tuple[int, int, int], step: NDArray, length: float, most: float) -> float:
-    """From a voxel's centre to its label's surface along steps of a length, mm; `most` or more if it is further."""
-    partition, levels, channel = labels
-    i, j, k = place
-    row, way = partition[i, j, k], 0.0
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+def _way(
+    labels: _Labels, place: tuple[int, int, int], direction: tuple[int, NDArray], length: float, most: float
+) -> float:
+    """From a voxel's centre to its label's surface along steps of a length, mm; `most` or more if it is further.
+
+    `direction` is its number and its step; those down have the numbers -1 to -D. A call would take twice as long as it.
+    """
+    partition, levels, channel, crossing = labels
+    (i, j, k), (d, step) = place, direction
+    own, way = partition[i, j, k], 0.0
     while way < most:
         a, b, c = i + step[0], j + step[1], k + step[2]
         is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
         if not is_in or partition[a, b, c] < 0:
             return way + 0.5 * length
         other = partition[a, b, c]
-        if other != row:
-            here = levels[channel[other], i, j, k] - levels[channel[row], i, j, k]
-            there = levels[channel[row], a, b, c] - levels[channel[other], a, b, c]
+        if other != own and len(crossing) > 0:
+            part = crossing[d, i, j, k] if d >= 0 else crossing[-1 - d, a, b, c]
+            if part == NO_CROSSING:  # cells that overlap
+                return way + 0.5 * length
+            fraction = part / (NO_CROSSING - 1.0)
+            return float(way + length * (fraction if d >= 0 else 1.0 - fraction))
+        if other != own:
+            here = levels[channel[other], i, j, k] - levels[channel[own], i, j, k]
+            there = levels[channel[own], a, b, c] - levels[channel[other], a, b, c]
             return float(way + length * here / max(here + there, 1e-6))
         i, j, k, way = a, b, c, way + length
     return way
@@ -151,3 +222,48 @@ def _spread_balls(thickness: NDArray, chord: NDArray, is_middle: NDArray, partit
                             is_in = y + ((c - k) * edges[2]) ** 2 <= r * r
                             if is_same and is_in and thickness[a, b, c] < size:
                                 thickness[a, b, c] = size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_crossings(
+    crossing: NDArray, corners: NDArray, ways: NDArray, edges: NDArray, ends: tuple[int, int], axis: int
+) -> None:
+    """Where triangles cross the ways (D, 3), mm, up from voxels' centres, the first of each; in a slab across an axis.
+
+    A triangle's height over a place is counted in lengths of its normal, which is no unit vector.
+    """
+    first, last, rise = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(len(ways))
+    for facet in range(len(corners)):
+        a, b, c = row(corners[facet], 0), row(corners[facet], 1), row(corners[facet], 2)
+        for d in range(3):
+            low, high = min(a[d], b[d], c[d]) / edges[d], max(a[d], b[d], c[d]) / edges[d]
+            first[d], last[d] = max(int(np.ceil(low)) - 1, 0), min(int(np.floor(high)) + 1, crossing.shape[1 + d] - 1)
+        first[axis], last[axis] = max(first[axis], ends[0]), min(last[axis], ends[1] - 1)
+        u, v = minus(b, a), minus(c, a)
+        normal = cross(u, v)
+        for s in range(len(ways)):
+            rise[s] = dot(normal, row(ways, s))
+        steepest = np.abs(rise).max()
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                for k in range(first[2], last[2] + 1):
+                    place = minus((i * edges[0], j * edges[1], k * edges[2]), a)
+                    height = dot(normal, place)
+                    if abs(height) > steepest:
+                        continue
+                    for s in range(len(ways)):
+                        if height * rise[s] > 0.0 or abs(height) > abs(rise[s]) or rise[s] == 0.0:
+                            continue
+                        t = -height / rise[s]
+                        if _is_within(minus(place, scaled(-t, row(ways, s))), u, v):
+                            part = np.uint8((NO_CROSSING - 1) * t + 0.5)
+                            crossing[s, i, j, k] = min(crossing[s, i, j, k], part)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_within(place: tuple[float, float, float], u: tuple[float, float, float], v: tuple[float, float, float]) -> bool:
+    """Whether a place in the plane of a triangle with one corner at the origin, u and v to the others, is in it."""
+    uu, vv, uv, along_u, along_v = dot(u, u), dot(v, v), dot(u, v), dot(u, place), dot(v, place)
+    square = uu * vv - uv * uv
+    first, second = vv * along_u - uv * along_v, uu * along_v - uv * along_u
+    return bool(min(first, second, square - first - second) >= -BESIDE_FRACTION * square)

@@ -166,7 +166,7 @@ def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]
     result = judged(mesh, source.content, of_cell, **came.requirements)
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
-    measured = fidelity(source.labels, source.mask, mesh, of_cell)
+    measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
     if not (source.content.is_plain and source.content.region is None):
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
     return fit, result, measured

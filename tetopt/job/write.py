@@ -109,7 +109,7 @@ def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, st
 def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> dict[str, Any]:
     """How well mask, labels, contrasts and sizes are met."""
     source = task.source
-    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed)
+    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed, source.content)
     if (table := _table_of(source)) is not None and table.names:
         measured["label_names"] = table.names
     counted = measured_each(_counts(task, result, model), failed)

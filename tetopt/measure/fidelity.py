@@ -23,7 +23,7 @@ from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box
 from tetopt.geometry.simplex import centroids, volumes
-from tetopt.geometry.topology import components, facets
+from tetopt.geometry.topology import Facets, components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
@@ -41,6 +41,25 @@ class FacetSurface(NamedTuple):
 
     points: NDArray[np.float64]  # (P, n)
     facets: NDArray[np.int64]  # (T, n), which points; not turned to any side
+
+
+class Thickness(NamedTuple):
+    """Percentiles of a label's local thickness, by `tetopt.label_thickness`.
+
+    Parameters
+    ----------
+    p5, p50, p95 : float
+        The 5th percentile, the median and the 95th, over the voxels' centres in the label, mm.
+
+    Examples
+    --------
+    >>> tetopt.Thickness(1.0, 1.5, 2.5).p50
+    1.5
+    """
+
+    p5: float
+    p50: float
+    p95: float
 
 
 class LabelFidelity(NamedTuple):
@@ -76,6 +95,10 @@ class LabelFidelity(NamedTuple):
         Nothing of the mesh carries it.
     distance_max : float
         The largest of the distances, mm: of single spikes, which a percentile does not see.
+    one_layer_fraction : float
+        Fraction of its cells' volume in cells whose nodes all lie on its surface: one cell thick; nan without cells.
+    thickness_voxels, thickness_mesh : Thickness, optional
+        Of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None where not measured.
 
     Examples
     --------
@@ -100,6 +123,9 @@ class LabelFidelity(NamedTuple):
     mesh_components: int
     is_lost: bool
     distance_max: float = np.nan
+    one_layer_fraction: float = np.nan
+    thickness_voxels: Thickness | None = None
+    thickness_mesh: Thickness | None = None
 
 
 class MaskFidelity(NamedTuple):
@@ -241,7 +267,9 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     n_empty = _counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
     overlap, beyond = _overlaps(labels, mesh, label_of_cell, len(n_true))
     boxes = scipy.ndimage.find_objects(true + 1)
-    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell)
+    shared = facets(mesh.cells)
+    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell, shared)
+    one_layer = one_layer_fractions(mesh, label_of_cell, shared)
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
     for label in np.flatnonzero(n_true):
@@ -269,6 +297,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
                 _n_components(mesh.cells[label_of_cell == label]),
                 bool(n_cells[label] == 0 and (label > 0 or owner.min() >= 0)),
                 float(distances.max(initial=0.0)) if len(distances) else np.nan,
+                one_layer.get(int(label), np.nan),
             )
         )
     return rows
@@ -484,11 +513,27 @@ def _counts(values: NDArray, weights: NDArray | None = None) -> NDArray:
     return np.bincount(values, weights, minlength=LARGEST_LABEL + 1)
 
 
+def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:
+    """Fraction of each label's volume in cells whose nodes all lie on its surface, by label; `shared` are its facets.
+
+    The surface is that of the label's cells to all else, the outside of the mesh among it.
+    """
+    near, far = np.where(shared.cells >= 0, of_cell[shared.cells], -1).T
+    is_surface = near != far
+    near, far, nodes = near[is_surface], far[is_surface], shared.nodes[is_surface]
+    size, fractions = volumes(mesh.points, mesh.cells), {}
+    for label in np.unique(of_cell).tolist():
+        is_on, is_own = np.zeros(len(mesh.points), dtype=bool), of_cell == label
+        is_on[nodes[(near == label) | (far == label)]] = True
+        is_single = is_on[mesh.cells[is_own]].all(axis=1)
+        fractions[label] = float(size[is_own][is_single].sum() / size[is_own].sum())
+    return fractions
+
+
 def _labels_beside_facets(
-    labels: Image, mesh: Mesh, of_cell: NDArray[np.int64]
+    labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """All facets (F, n), and the labels on their two sides (F, 2): outside is 0, behind the box what is before it."""
-    shared = facets(mesh.cells)
     sides = of_cell[shared.cells]
     is_outer = shared.n_cells == 1
     is_on_box = facets_on_box(mesh, labels)[1]  # in the same order

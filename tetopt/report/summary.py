@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, plain
+from tetopt.contents.content import Content, content, plain
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
@@ -21,6 +21,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import Quality, quality
+from tetopt.measure.thin import contact_totals, label_contacts, label_thickness
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
@@ -69,13 +70,13 @@ def run_summary(
     if shapes is None:
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
     first, last = result.history[0], result.history[-1]
-    content = plain(image)
-    spread = content.variance * content.volume
+    own = plain(image)
+    spread = own.variance * own.volume
     return {
         **about,
         "versions": versions(),
         "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
-        "image_properties": image_summary(content),
+        "image_properties": image_summary(own),
         "ended": result.ended,
         "iterations_done": last.iteration,
         "energies": {
@@ -120,14 +121,16 @@ def model_summary(model: Model) -> dict[str, Any]:
 
 
 def fidelity(
-    labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None
-) -> dict[str, Any]:
+    labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None,
+    what: Content | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """How well a mesh represents a mask and labels.
 
     A `MaskFidelity` in `mask`, and for each label a `LabelFidelity` in `labels` and a `LabelInterface` in `interfaces`;
-    each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
-    as well, is left out. `of_cell` (M,) is each cell's label, by default that of most of its voxels; `failed` as of
-    `measured_each`.
+    of each two labels a `LabelContact` in `contacts`, their sums in `contact_totals`.
+    Each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
+    as well, is left out of the first two. `of_cell` (M,) is each cell's label, by default that of most of its voxels;
+    `failed` as of `measured_each`; `what` is of these labels and this mask, where their levels are known.
     """
     measures: dict[str, Callable[[], Any]] = {}
     if mask is not None:
@@ -136,13 +139,33 @@ def fidelity(
         inside = labels if mask is None else Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
         first = 0 if mask is None else 1
 
+        def own() -> NDArray[np.int64]:
+            return cell_labels(inside, mesh) if of_cell is None else of_cell
+
         def measured_labels(measure: Callable[[Image, Mesh, NDArray], list[Any]]) -> list[Any]:
-            own = cell_labels(inside, mesh) if of_cell is None else of_cell
-            return [row for row in measure(inside, mesh, own) if row.label >= first]
+            return [row for row in measure(inside, mesh, own()) if row.label >= first]
 
         measures["labels"] = lambda: measured_labels(label_fidelity)
+        if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
+            measures["thickness"] = lambda: label_thickness(_with_levels(what, labels, mask), mesh, own())
         measures["interfaces"] = lambda: measured_labels(label_interfaces)
-    return measured_each(measures, failed)
+        measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
+    measured = measured_each(measures, failed)
+    thickness = measured.pop("thickness", {})
+    if "labels" in measured:
+        columns = ("thickness_voxels", "thickness_mesh")
+        measured["labels"] = [
+            row._replace(**dict(zip(columns, thickness.get(row.label, (None, None)), strict=True)))
+            for row in measured["labels"]
+        ]
+    if "contacts" in measured:
+        measured["contact_totals"] = contact_totals(measured["contacts"])
+    return measured
+
+
+def _with_levels(what: Content | None, labels: Image, mask: Image | None) -> Content:
+    """The content if it has levels of labels, or else one of the labels alone that has them."""
+    return what if what is not None and what.memberships is not None else content(labels, labels, mask)
 
 
 def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:

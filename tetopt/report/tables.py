@@ -10,13 +10,16 @@ from rich.table import Table
 
 from tetopt.engine.curving import Curving
 from tetopt.geometry.quadratic import node_count
-from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
+from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, Thickness
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
+from tetopt.measure.thin import TOLERATED_CONTACT, LabelContact
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
 
 CHANGED_FRACTION = 0.2  # of a label's size: what cells have more or less is said in words
+WORST_ROWS = 5  # of labels and of pairs that are shown; run.json has all
+TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
 LARGE_SIZE = 1e4  # mm3 or mm2: of a label so large its tenths are not shown
 
 
@@ -122,7 +125,7 @@ def label_table(
     )  # fmt: skip
     for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
-        words = escape(f"{row.label} {names.get(row.label, '')}".strip())
+        words = _label_words(row.label, names)
         size = _decimals(row.volume, 1 if row.volume < LARGE_SIZE else 0)
         apart = [_decimals(mm, 3) for mm in (row.distance_mean, row.distance_p95, row.distance_max)]
         table.add_row(
@@ -136,6 +139,53 @@ def label_table(
 
 def _decimals(number: float, count: int) -> str:
     return f"{number:.{count}f}" if np.isfinite(number) else "-"
+
+
+def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
+    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, of equal ones the thinnest."""
+    table = new_table(
+        "thin labels", "in one layer, %", "voxels, mm: 5 %", "50 %", "95 %", "cells, mm: 5 %", "50 %", "95 %"
+    )
+    there = [row for row in rows if row.n_cells]
+
+    def goodness(row: LabelFidelity) -> tuple[float, float, int]:
+        return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label
+
+    for row in sorted(there, key=goodness)[:WORST_ROWS]:
+        thickness = [text for each in (row.thickness_voxels, row.thickness_mesh) for text in _percentile_texts(each)]
+        table.add_row(_label_words(row.label, names), _decimals(100.0 * row.one_layer_fraction, 1), *thickness)
+    return table
+
+
+def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], ndim: int) -> Table | None:
+    """Pairs that touch over 1.5 times as much as in the voxels, those by most first; None if there are none."""
+    more = [each for each in contacts if each.mesh_mm2 > TOLD_CONTACT * each.voxels_mm2]
+    if not more:
+        return None
+    unit = "mm2" if ndim == 3 else "mm"
+    table = new_table("contact", f"of cells, {unit}", f"of voxels, {unit}", "ratio")
+    for each in sorted(more, key=lambda each: each.voxels_mm2 - each.mesh_mm2)[:WORST_ROWS]:
+        words = ", ".join(_label_words(label, names) for label in each.labels)
+        ratio = _decimals(each.ratio, 2) if each.voxels_mm2 else "false"
+        table.add_row(words, f"{each.mesh_mm2:.1f}", f"{each.voxels_mm2:.1f}", ratio)
+    return table
+
+
+def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
+    """How much labels touch that should not, in one line."""
+    unit = "mm2" if ndim == 3 else "mm"
+    return (
+        f"contact over {TOLERATED_CONTACT:g} times the voxels': {totals['excess_mm2']:.1f} {unit}, of which "
+        f"{totals['false_mm2']:.1f} {unit} between labels that do not touch in the voxels"
+    )
+
+
+def _percentile_texts(thickness: Thickness | None) -> list[str]:
+    return ["-"] * 3 if thickness is None else [f"{mm:.2f}" for mm in thickness]
+
+
+def _label_words(label: int, names: Mapping[int, str]) -> str:
+    return escape(f"{label} {names.get(label, '')}".strip())
 
 
 def label_differences(

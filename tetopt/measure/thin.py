@@ -1,0 +1,213 @@
+"""Thin labels: their local thickness, and the contact of each two labels, in voxels and mesh.
+
+Thickness is measured at the same voxel centres in both, between the labels' smooth surfaces and between the facets of
+the mesh, along the same 13 directions. These make it up to 8 % too large in cubic voxels (25 % where one edge is twice
+another), alike in both. A sheet that no voxel's centre lies in is not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.contents.content import Content
+from tetopt.contents.domain import INSIDE_FRACTION
+from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.contents.thickness import BEYOND_REGION, local_thickness, thickness_between
+from tetopt.energy.sampling import cell_of_voxel
+from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
+from tetopt.image import Image
+from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, surface_areas
+from tetopt.mesh import Mesh
+
+THICK_VOXELS = 10.0  # edges of a voxel (its shortest): what is thicker counts as so thick
+STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # area of a smooth surface over that of voxels' faces, mean over directions
+TOLERATED_CONTACT = 1.2  # of the voxels' contact: what a mesh has more is excess
+LABEL_BASE = LARGEST_LABEL + 1  # numbers a pair of labels
+
+
+class LabelContact(NamedTuple):
+    """How far two labels touch. In 2-D areas are lengths, mm.
+
+    Parameters
+    ----------
+    labels : (int, int)
+        The two, ascending.
+    mesh_mm2 : float
+        Area of the facets between their cells.
+    voxels_mm2 : float
+        Area of the faces between their voxels times 2/3 (pi/4 in 2-D): a smooth surface's, in the mean over directions.
+    ratio : float
+        The mesh's over the voxels'; nan where their voxels do not touch.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
+    >>> (contact,) = tetopt.label_contacts(labels, mesh, tetopt.cell_labels(labels, mesh))
+    >>> contact.labels
+    (0, 1)
+    """
+
+    labels: tuple[int, int]
+    mesh_mm2: float
+    voxels_mm2: float
+    ratio: float
+
+
+def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None) -> list[LabelContact]:
+    """Area over which each two labels touch, in the mesh and in the voxels.
+
+    Facets on the mesh's boundary, and faces of voxels on the box or on the mask, are between no two labels.
+
+    Parameters
+    ----------
+    labels : Image
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
+    mesh : Mesh
+        Points in world mm.
+    of_cell : (M,) array of whole numbers
+        Label of each cell, such as `tetopt.cell_labels` returns.
+    mask : Image, optional
+        On the same voxels; only those of 1/2 and more count.
+
+    Returns
+    -------
+    list of LabelContact
+        One for each pair that touches in the mesh or in the voxels, ascending.
+
+    Raises
+    ------
+    InputError
+        Values that are no labels, not one label a cell, or a mask on other voxels.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> result = tetopt.mesh_image(tetopt.content(labels, labels), 300)
+    >>> for each in tetopt.label_contacts(labels, result.mesh, result.labels):
+    ...     print(each.labels, f"{each.ratio:.2f}")
+    (0, 1) 0.99
+    """
+    check_labels("labels", labels)
+    of_cell = checked_cell_labels(of_cell, mesh)
+    if mask is not None and mask.shape != labels.shape:
+        raise InputError(f"mask: expected the shape of labels, {labels.shape}, got {mask.shape}; resample it first")
+    shared = facets(mesh.cells)
+    sides = of_cell[shared.cells]
+    is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
+    area = surface_areas(FacetSurface(mesh.points, shared.nodes[is_contact]))
+    in_mesh = _by_pair(sides[is_contact, 0], sides[is_contact, 1], area)
+    in_voxels = _voxel_contacts(labels, None if mask is None else mask.data >= INSIDE_FRACTION)
+    return [
+        LabelContact(
+            (pair // LABEL_BASE, pair % LABEL_BASE), in_mesh.get(pair, 0.0), in_voxels.get(pair, 0.0),
+            in_mesh.get(pair, 0.0) / in_voxels[pair] if pair in in_voxels else np.nan,
+        )
+        for pair in sorted(in_mesh | in_voxels)
+    ]  # fmt: skip
+
+
+def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
+    """Area, mm^(n-1), of pairs that do not touch in the voxels, and of all contact over 1.2 times the voxels'."""
+    return {
+        "false_mm2": float(sum(each.mesh_mm2 for each in contacts if each.voxels_mm2 == 0.0)),
+        "excess_mm2": float(sum(max(each.mesh_mm2 - TOLERATED_CONTACT * each.voxels_mm2, 0.0) for each in contacts)),
+    }
+
+
+def _voxel_contacts(labels: Image, inside: NDArray[np.bool_] | None) -> dict[int, float]:
+    """Area of each pair's faces between voxels that are inside, as smooth surfaces have it."""
+    data = labels.data.astype(np.int32)
+    total: dict[int, float] = {}
+    for axis, edge in enumerate(labels.spacing):
+        along = np.moveaxis(data, axis, 0)
+        is_contact = along[:-1] != along[1:]
+        if inside is not None:
+            is_in = np.moveaxis(inside, axis, 0)
+            is_contact &= is_in[:-1] & is_in[1:]
+        face = STAIRS[labels.ndim] * float(np.prod(labels.spacing)) / float(edge)
+        of_axis = _by_pair(along[:-1][is_contact], along[1:][is_contact])
+        for pair, count in of_axis.items():
+            total[pair] = total.get(pair, 0.0) + face * count
+    return total
+
+
+def _by_pair(one: NDArray, other: NDArray, weights: NDArray[np.float64] | None = None) -> dict[int, float]:
+    """Sums over pairs of labels, by the number of the pair."""
+    pairs = np.minimum(one, other) * np.int64(LABEL_BASE) + np.maximum(one, other)
+    numbers, place = np.unique(pairs, return_inverse=True)
+    return dict(zip(numbers.tolist(), np.bincount(place, weights, len(numbers)).astype(float).tolist(), strict=True))
+
+
+def label_thickness(
+    what: Content, mesh: Mesh, of_cell: ArrayLike
+) -> dict[int, tuple[Thickness | None, Thickness | None]]:
+    """Local thickness of each label, between the smooth surfaces of its voxels and between the facets of its cells.
+
+    Parameters
+    ----------
+    what : Content
+        With labels whose interfaces are smooth: their levels are the smooth surfaces, and its voxels (finer ones where
+        slices are thick) the places at which both are measured.
+    mesh : Mesh
+        Points in world mm.
+    of_cell : (M,) array of whole numbers
+        Label of each cell.
+
+    Returns
+    -------
+    dict
+        By label, of its voxels and of its cells, each None without a voxel's centre in them. Values above ten edges of
+        a voxel (the shortest) are cut off there. On a mask both end half a voxel beyond the last centre inside.
+
+    Raises
+    ------
+    InputError
+        A content without such labels, not one label a cell, or not enough memory.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
+    >>> result = tetopt.mesh_image(what, 300, iterations=4)
+    >>> voxels, cells = tetopt.label_thickness(what, result.mesh, result.labels)[1]
+    >>> f"{voxels.p50:.0f} mm of voxels, {cells.p50:.0f} mm of cells"
+    '39 mm of voxels, 37 mm of cells'
+    """
+    of_cell = checked_cell_labels(of_cell, mesh)
+    members, grid = what.memberships, what.image
+    if members is None:
+        raise InputError("content: expected labels with smooth interfaces, got none; make it by content(image, labels)")
+    inside = None if what.region is None else what.region.inside
+    most = THICK_VOXELS * float(min(grid.spacing))
+    spacing = np.asarray(grid.spacing, dtype=np.float64)
+    rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    of_voxels = _percentiles(local_thickness(members, spacing, most, inside), rows, members.labels)
+    values, row = np.unique(of_cell, return_inverse=True)
+    owner = cell_of_voxel(grid, mesh)
+    rows = np.where(owner >= 0, row[owner], BEYOND_REGION)
+    shared = facets(mesh.cells)
+    is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
+    corners = (grid.to_index(mesh.points) * spacing)[shared.nodes[is_between]]
+    of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values)
+    return {label: (of_voxels.get(label), of_cells.get(label)) for label in sorted(of_voxels | of_cells)}
+
+
+def _percentiles(
+    thickness: NDArray[np.float32], rows: NDArray[np.int64], values: NDArray[np.int64]
+) -> dict[int, Thickness]:
+    """Percentiles of the thickness at the voxels of each row, by label."""
+    percentiles = {}
+    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
+        if box is not None:
+            own = thickness[box][rows[box] == row]
+            percentiles[int(values[row])] = Thickness(*np.percentile(own, [5.0, 50.0, 95.0]).astype(float).tolist())
+    return percentiles
