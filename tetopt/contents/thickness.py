@@ -185,7 +185,9 @@ def _way(
     while way < most:
         a, b, c = i + step[0], j + step[1], k + step[2]
         is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
-        if not is_in or partition[a, b, c] < 0:
+        if not is_in:
+            return most
+        if partition[a, b, c] < 0:
             return way + 0.5 * length
         other = partition[a, b, c]
         if other != own and len(crossing) > 0:

@@ -127,6 +127,9 @@ class RegionOptions:
         float | None,
         Option("W", "Tension of surfaces between labels, voxels, to 10 (default 0.3; 0 leaves voxels their stairs)."),
     ] = None
+    free_volumes: Annotated[
+        bool, Option(None, "Labels thinner than cells may lose volume; by default cells are theirs for as much.")
+    ] = False
     label_weight: Annotated[
         float | None, Option("W", "How much the labels count beside the first IMAGE (default 1).")
     ] = None

@@ -181,7 +181,16 @@ def resolved(job: JobOptions) -> Plan:
     _check_numbers(job)
     check_solver_options(job.output, job)
     mode = _mode(job)
-    for name in ("size_min", "edge_size", "edge_max", "gradation", "sizing", "target_error"):
+    for name in (
+        "size_min",
+        "edge_size",
+        "edge_max",
+        "gradation",
+        "sizing",
+        "cells_across",
+        "label_size",
+        "target_error",
+    ):
         if mode != "graded" and getattr(job, name) is not None:
             raise InputError(
                 f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
@@ -212,6 +221,8 @@ def _check_source(job: JobOptions) -> None:
         for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
             if getattr(job, name) is not None:
                 raise InputError(f"`{name}`: there are no `labels`")
+        if job.free_volumes:
+            raise InputError("`free_volumes`: there are no `labels`")
     if job.merge is not None and merge_file(job.merge) is None:
         groups_of(job.merge)
 

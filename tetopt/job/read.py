@@ -78,7 +78,7 @@ def read_planned(plan: Plan) -> Task:
     size = size_of_run(plan, source.content, source.contrasts[0], n_started)
     # With the checksums of the files as they are now.
     request = requested(changed(plan.bare, parts=plan.division.n_parts))
-    return Task(plan, source, begun, sizes, size, request)
+    return Task(plan, source, begun, sizes, size, request, by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -138,7 +138,7 @@ def read_source(
         balance = balance._replace(weights=[0.0])
     represented = content(
         contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
-        keep_components=options.keep_components,
+        keep_components=options.keep_components, keep_volumes=not options.free_volumes,
     )  # fmt: skip
     of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
     files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
@@ -148,6 +148,7 @@ def read_source(
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
         **({} if tissues is None else {"tissues": [path.name for path in of_tissues]}),
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
+        **({"free_volumes": True} if options.free_volumes else {}),
         **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},

@@ -13,6 +13,7 @@ from tetopt.job.source import Source
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
+from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import Sizes
 
 Shapes = tuple[Quality | None, Quality | None]
@@ -36,6 +37,8 @@ class Task(NamedTuple):
         Numbers of voxels, nodes and iterations, by which time and memory are predicted.
     request : dict
         What decides the outputs: options, checksums of files, the version.
+    by_label : SizesByLabel, optional
+        What sizes labels get, if sizes by label are asked for.
 
     Examples
     --------
@@ -51,6 +54,7 @@ class Task(NamedTuple):
     sizes: Sizes | None
     size: RunSize
     request: dict[str, Any]
+    by_label: SizesByLabel | None = None
 
     @property
     def start_name(self) -> str:

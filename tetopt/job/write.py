@@ -134,6 +134,10 @@ def numbers_of(
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
     summary["image_properties"] = image_summary(source.own)  # on its own voxels, not on divided ones
     summary["request"] = task.request
+    if task.by_label is not None:
+        made = task.by_label
+        rows = [row._asdict() for row in made.layers]
+        summary["label_sizes"] = {"nodes": made.nodes, "scale": made.scale, "labels": rows}
     memory = {"peak_bytes": peak_bytes(), **came.predicted.get("memory", {})}
     return summary | {"memory": memory, "prediction": came.predicted["prediction"]}
 
