@@ -113,7 +113,7 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy
     is_counted[is_counted] = ~is_sampled[owner[is_counted]]
     cell, row, weight = [owner[is_counted]], [members.partition.ravel()[is_counted]], [np.ones(is_counted.sum())]
     for part in np.array_split(np.flatnonzero(is_sampled), 1 + is_sampled.sum() // SAMPLED_AT_ONCE):
-        inner = SAMPLES[image.ndim]
+        inner = PART_CENTRES[image.ndim]
         corners = mesh.points[mesh.cells[part]]
         row.append(labels_at(members, image.to_index((inner @ corners).reshape(-1, image.ndim))))
         cell.append(np.repeat(part, len(inner)))
@@ -129,7 +129,7 @@ def _samples(n: int, parts: int) -> NDArray[np.float64]:
     return (whole + 0.5) / (parts + 0.5 * (n + 1))
 
 
-SAMPLES = {2: _samples(2, 4), 3: _samples(3, 3)}  # 15 and 20 places
+PART_CENTRES = {2: _samples(2, 4), 3: _samples(3, 3)}  # 15 and 20 barycentric places in a cell, by dimension
 
 
 def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:

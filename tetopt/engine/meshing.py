@@ -178,16 +178,14 @@ def mesh_image(
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
     if mode == "graded" and sizes is not None:
         sizes = with_label_sizes(sizes, content, nodes, order)[0]
-    if mode == "graded" and nodes is None and target_error is None and sizes is not None:
-        nodes = values["nodes"] = _nodes_of(content, sizes, order)
+        if nodes is None and target_error is None:
+            nodes = values["nodes"] = _nodes_of(content, sizes, order)
     _check_mode(mode, content, values | {"sizes": sizes}, order)
     default_k_D, default_iterations = MODE_DEFAULTS[mode]
     options["k_D"] = default_k_D if k_D is None else k_D
     options["iterations"] = default_iterations if iterations is None else iterations
-    if mode == "start":
-        options.setdefault("boundary", "fixed")
-    if mode == "graded":
-        sizes = sizes_of_order(content, nodes, sizes, order)
+    options |= {"boundary": "fixed"} | options if mode == "start" else {}
+    sizes = sizes_of_order(content, nodes, sizes, order) if mode == "graded" else sizes
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> MeshingResult:

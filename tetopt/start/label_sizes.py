@@ -23,7 +23,7 @@ from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Si
 EVERY_LABEL = "*"  # all labels that have no size of their own
 SIZE_FORM = re.compile(r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?")
 DEFAULT_SIZED_NODES = 5000  # of the uniform mesh whose edges are the largest where neither nodes nor lengths are given
-THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)
+THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # of its voxels, by which a label is told
 BELOW_FRACTION = 0.98  # of the cells asked for: where fewer lie across, a place counts as below
 SCALE_STEPS = 12  # of bisection for the factor by which a number of nodes makes sizes larger: to a thousandth
 LARGEST_SCALE = 64.0  # of that factor

@@ -51,6 +51,8 @@ TRIAL_MISS = 0.05  # so near, no other size of the undivided blocks is tried;
 LARGEST_MISS = 0.1  # further away it is an error,
 LARGEST_MISS_NODES = 40  # unless it is by so few nodes: about what one block more or less makes.
 BISECTION_STEPS = 60  # for the threshold, at most: it is then known to the last bit
+TARGET_TRIAL_MISS = 0.25  # so near, with targets, no other number is tried within a mask: exchanges reach any number
+LIGHTER_TRIALS = 5  # of factors on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 ALWAYS_ALLOWED_NODES = 5000  # even on images of fewer voxels
 LEAF_VOXELS = 2.0  # the least edge of a leaf where voxels are smallest; a quarter where they are largest
@@ -243,7 +245,9 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     image, region = content.image, content.region
     if region is None:
         return _octree_of_box(content, nodes, limits)
-    # The surface takes away nodes and adds others; how many is known only afterwards.
+    # The surface takes away nodes and adds others; how many is known only afterwards. Towards targets exchanges follow.
+    miss = TRIAL_MISS if limits.target is None else TARGET_TRIAL_MISS
+    limits = _lighter(content, nodes, limits)
     nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
         try:
@@ -255,10 +259,29 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
             continue
         count = len(mesh.points)
         nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
-        if abs(count - nodes) <= TRIAL_MISS * nodes:
+        if abs(count - nodes) <= miss * nodes:
             break
         in_box = int(np.clip(in_box * nodes / count, max(fewest, in_box / 2), 2 * in_box))
     return nearest[0]
+
+
+def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits:
+    """The limits with larger targets, where these alone divide the region's blocks into far more nodes than asked for.
+
+    A block goes by its least target. Found by counts: a mesh of a million nodes too many takes minutes.
+    """
+    if limits.target is None:
+        return limits
+    roots = next(_root_counts(content.image, nodes, limits))
+    channels = channels_of(content)
+    for _ in range(LIGHTER_TRIALS):
+        blocks = _blocks_by_depth(content, channels, roots, limits)
+        regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
+        count = len(_leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions))
+        if count <= (1.0 + TARGET_TRIAL_MISS) * nodes:
+            break
+        limits = limits._replace(target=limits.target * np.float32((count / nodes) ** (1.0 / content.image.ndim)))
+    return limits
 
 
 def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
