@@ -5,6 +5,7 @@ ORDER = (
     "ventricles",
     "organ_from_mask",
     "tissues_from_labels",
+    "nested_shells",
     "calculix",
     "two_contrasts",
     "target_error",

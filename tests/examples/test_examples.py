@@ -36,6 +36,7 @@ NUMBERS = {
     "ventricles": Number("volume_ml", ".2f", "16.96"),
     "organ_from_mask": Number("dice", ".4f", "0.9946"),
     "tissues_from_labels": Number("white_dice", ".4f", "0.8130"),
+    "nested_shells": Number("volume", ".3f", "0.988"),
     "two_contrasts": Number("worst", ".4f", "0.0084"),
     "target_error": Number("needed", "d", "125"),
     "k_d": Number("gain", ".1%", "54.4%"),

@@ -40,6 +40,7 @@ RIGHT = {
     "load_mesh": {"path": "a.vtu"},
     "load_phantom": {"name_or_path": "a.toml"},
     "mask_fidelity": {"mask": LABELS, "mesh": MESH},
+    "merge_labels": {"labels": LABELS, "merge": "a=1; b=*", "names": {1: "c"}},
     "mesh_image": {
         "image": IMAGE, "nodes": 100, "target_error": None, "start": None, "spacing": None, "sizes": None,
         "mode": "graded",
@@ -54,6 +55,7 @@ RIGHT = {
     "read_frd": {"path": "a.frd", "mesh": MESH},
     "register_format": {"suffix": ".a", "write": str, "what": "a", "runs": True},
     "read": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
+    "resample_tissue": {"tissue": IMAGE, "image": IMAGE},
     "run": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
     "run_cohort": {"subjects": "t.tsv", "output": "out"},
     "save_image": {"path": "a.nii", "image": IMAGE},
@@ -61,8 +63,10 @@ RIGHT = {
     "save_model": {"path": "a.inp", "model": MODEL, "space": "ras"},
     "save_surface": {"path": "a.stl", "about": "", "space": "ras"},
     "segment": {"image": IMAGE, "mesh": MESH, "classes": 2},
+    "sizes_by_label": {"sizes": tetopt.Sizes(cells_across=1), "image": tetopt.content(LABELS, LABELS), "nodes": 100},
     "solution_fields": {"mesh": MESH, "step": 1},
     "solve": {"model": MODEL, "step": 1},
+    "tissue_labels": {"tissues": [IMAGE]},
     "extract_surface": {"points": MESH.points, "cells": MESH.cells, "chosen": [True]},
 }  # fmt: skip
 WRONG = {
@@ -161,6 +165,14 @@ def test_records_are_looked_into():
 def test_a_mesh_of_anything(arrays):
     with pytest.raises(tetopt.InputError, match="mesh"):
         tetopt.Mesh(*arrays)
+
+
+def test_tables_are_looked_into_as_records_are():
+    """Sizes by label that are no table, and names of labels that are none."""
+    with pytest.raises(tetopt.InputError, match=r"^sizes_by_label: sizes\.by_label: expected dict.* or None, got 5$"):
+        tetopt.sizes_by_label(tetopt.Sizes(by_label=5), tetopt.content(LABELS, LABELS))
+    with pytest.raises(tetopt.InputError, match=r"^merge_labels: names: expected dict.* or None, got 500$"):
+        tetopt.merge_labels(LABELS, "a=foo; b=*", 500)
 
 
 def test_an_image_of_anything():

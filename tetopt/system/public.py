@@ -11,7 +11,7 @@ import functools
 import inspect
 import numbers
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -91,8 +91,8 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
         return isinstance(value, {"str": str, "bool": bool | np.bool_, "Path": Path}[kind])
     if head in ARRAY_WORDS:
         return _is_array(value) and (head not in TABLE_WORDS or (isinstance(value, np.ndarray) and value.ndim == 2))
-    if head == "dict":
-        return isinstance(value, dict)
+    if head in ("dict", "Mapping"):
+        return isinstance(value, dict if head == "dict" else Mapping)
     if head == "Callable":
         return callable(value)
     if head in ("Sequence", "Iterable", "tuple"):
@@ -109,7 +109,7 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
 def _in_words(kind: str, names: dict[str, Any]) -> str:
     if get_origin(names.get(kind)) is Literal:
         return " or ".join(get_args(names[kind]))
-    return NAMES_OF_KINDS.get(kind, kind)
+    return NAMES_OF_KINDS.get(kind, kind.replace("Mapping[", "dict["))
 
 
 def _is_number(value: Any, is_whole: bool) -> bool:
