@@ -48,9 +48,9 @@ PLACE_TENSION = 3.0  # likewise, where they touch
 APART_WEIGHT = 10.0  # where such labels meet at a node or an edge alone: a sheet between them is pierced
 LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs that touch less do so at places, not everywhere
 BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more hardly change it
-BALANCE_STEP = 20.0  # times the square of the fraction of its volume that a label lacks: its bias rises so much,
-LONGEST_BALANCE_STEP = 0.15  # at most,
-FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known. By the square, as facets alone cost what is round 1 %
+BALANCE_STEP = 3.0  # times the fraction of its volume that a label lacks: its bias rises so much,
+LONGEST_BALANCE_STEP = 0.1  # at most,
+FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known
 MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
 
@@ -185,7 +185,7 @@ def balanced(
 ) -> NDArray[np.float64]:
     """The bias of each label, raised where its volume is below its aim, lowered where it is above; all (K,)."""
     missing = np.where(aim > 0.0, 1.0 - volume / np.where(aim > 0.0, aim, 1.0), 0.0)
-    step = np.clip(BALANCE_STEP * missing * np.abs(missing), -longest, longest)
+    step = np.clip(BALANCE_STEP * missing, -longest, longest)
     return np.asarray(np.clip(bias + step, -MOST_BIAS, MOST_BIAS))
 
 
