@@ -120,9 +120,6 @@ WITH_IMAGE = {
     "label_interfaces": lambda image, mesh: tetopt.label_interfaces(
         labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
     ),
-    "label_thickness": lambda image, mesh: tetopt.label_thickness(
-        tetopt.content(image, labels_of(image)), mesh, np.arange(len(mesh.cells)) % 2
-    ),
     "mask_fidelity": lambda image, mesh: tetopt.mask_fidelity(labels_of(image), mesh),
     "mesh_image": lambda image, mesh: tetopt.mesh_image(image, start=mesh, iterations=1),
     "build_model": lambda image, mesh: tetopt.build_model(mesh, image, young=3.0),
@@ -131,6 +128,9 @@ WITH_IMAGE = {
     "segment": lambda image, mesh: tetopt.segment(image, mesh, 2),
 }
 MORE = {
+    "label_thickness": lambda image, mesh: tetopt.label_thickness(
+        tetopt.content(image, labels_of(image)), mesh, np.arange(len(mesh.cells)) % 2
+    ),
     "labelled": lambda image, mesh: tetopt.optimize(
         tetopt.content(image, labels_of(image)), mesh, iterations=3, nodes=len(mesh.points)
     ),

@@ -541,7 +541,7 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 6, "What is meshed": 10, "Number and size of cells": 7, "The mesh it begins with": 4,
+        "Options": 6, "What is meshed": 13, "Number and size of cells": 9, "The mesh it begins with": 4,
         "Optimisation": 11, "Beyond one memory": 5, "For the solver": 13,
     }  # fmt: skip
 

@@ -1,5 +1,6 @@
 """The command with masks, backgrounds, labels and several contrasts."""
 
+import json
 import re
 
 import nibabel
@@ -209,10 +210,13 @@ def test_a_label_never_vanishes_silently(tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(labels))
     # The lattice itself, much coarser than the sheets.
     command = ["mesh", path, "--labels", path, "--uniform", "--nodes", "60", "--iterations", "0"]
-    assert exit_code(*command, "-o", tmp_path / "a.vtu") == 1
+    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--free-volumes") == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "no cell has label 3, of more than 200 voxels; allow more nodes" in said
     assert "no cell has label 1, 2, of 200 voxels or fewer" in said
+    # Labels whose volumes are kept have cells there, too.
+    assert exit_code(*command, "-o", tmp_path / "b.vtu", "--json", tmp_path / "b.json") == 0
+    assert all(row["n_cells"] > 0 for row in json.loads((tmp_path / "b.json").read_text())["labels"])
 
 
 def test_a_slice_of_all(inputs, tmp_path):

@@ -83,7 +83,7 @@ def test_edges_of_cells_that_would_fold_go_part_of_the_way(sphere, monkeypatch):
     monkeypatch.setattr("tetopt.engine.curving.LEAST_JACOBIAN", 0.8)
     mesh, curving = curved(straight(result.mesh), content, result.labels)
     assert curving.n_part_way > 50
-    assert curving.n_straight > result.curving.n_straight
+    assert curving.n_straight >= result.curving.n_straight
     assert curving.n_on_level < result.curving.n_on_level
     assert curving.least_jacobian >= 0.8
     assert jacobian_bounds(*quadratic(mesh.points, mesh.cells, mesh.midpoints)).min() >= 0.8

@@ -249,7 +249,7 @@ def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
     is_curve = state.complex.meeting[:, 2] >= 0
     assert is_curve.sum() > 5
     at = state.complex.ticks[is_curve] * 2.0**-state.objective.bits
-    assert np.abs(at[:, :2] - 9.5).max() < 0.5
+    assert np.abs(at[:, :2] - 9.5).max() < 0.75  # levels are smooth: the edge of a quarter is rounded off
     normal = np.zeros((7, 3))
     for node in np.flatnonzero(is_curve):
         assert constraint_values(normal, state, node) == 2

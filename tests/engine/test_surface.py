@@ -231,7 +231,7 @@ def test_labels_that_meet_in_edges_and_points():
     assert tetopt.check_mesh(result.mesh, labels) == []
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-9
     assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9, abs=1e-9)
-    rows = {row.label: row for row in label_fidelity(labels, result.mesh)}
+    rows = {row.label: row for row in label_fidelity(labels, result.mesh, result.labels)}
     for label in range(1, 9):
         assert rows[label].dice > 0.995
         assert rows[label].components == 1

@@ -115,17 +115,3 @@ def test_a_shell_of_one_cell_is_whole(thickness, percent):
     assert [row.mesh_euler for row in rows] == [2, 4, 4]  # two spheres around the shell: no hole
     assert contact(result.mesh, result.labels, 1, 3) < 1e-3 * rows[1].area
     assert dict(result.violated) == {}
-
-
-@pytest.mark.full
-def test_without_volumes_kept_a_thin_label_goes():
-    image = shell_image(36, 1.5, 10.0)
-    content, free = (tetopt.content(image, image, weights=[0.0], keep_volumes=keeps) for keeps in (True, False))
-    sizes, made = [], []
-    for each in (content, free):
-        result = tetopt.mesh_image(each, 400, iterations=8)
-        size = volumes(result.mesh.points, result.mesh.cells)
-        sizes.append(size[result.labels == 2].sum())
-        made.append(result)
-    aim = (image.data == 2).sum()
-    assert abs(sizes[0] / aim - 1.0) < abs(sizes[1] / aim - 1.0)

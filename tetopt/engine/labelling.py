@@ -132,6 +132,8 @@ def labelled(
     begin = _majority(dual)
     dual.bias[:] = _balance(dual, aim, least) if bias is None else bias
     labels = _majority(dual)
+    if dual.bias.any():
+        _keep_each(dual, labels)
     _settle(dual, labels, least, False)
     is_bridge = np.zeros(len(labels), dtype=bool)
     for _ in range(MENDING_ROUNDS):
@@ -165,6 +167,19 @@ def unpinched(
     dual, labels = _dual(points, cells, across, counts, contacts, None), labels.copy()
     _mend_pairs(dual, labels, np.full(counts.shape[1], float(dual.size.min())))
     return labels
+
+
+def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
+    """Give labels without cells the one that has most of them, unless that is far more of others."""
+    cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
+    n_of = np.bincount(labels, minlength=len(dual.bias))
+    for label in np.setdiff1d(dual.row, labels):
+        place = np.flatnonzero(dual.row == label)
+        place = place[np.argmax(dual.volume[place])]
+        best = cell[place]
+        if dual.volume[place] > 0.5 * (1.0 - MOST_BIAS) * dual.size[best] and n_of[labels[best]] > 1:
+            n_of[labels[best]] -= 1
+            labels[best] = label
 
 
 def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
