@@ -35,7 +35,7 @@ from tetopt.mesh import Mesh
 from tetopt.system.kernels import Floats1, Ints1, entry, helper, unit
 
 FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
-SEEN_FRACTION = 0.5  # of a label's voxels: of one that samples show less of its centres are counted, too
+SAMPLED_FRACTION = 0.5  # of a label's voxels: of one that samples show less of its centres are counted, too
 SAMPLED_AT_ONCE = 100_000  # cells: 50 MB of places
 BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
 SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
@@ -124,7 +124,7 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy
     rows = members.partition.ravel()[owner >= 0]
     seen = np.bincount(np.concatenate(row), np.concatenate(weight), shape[1])
     is_unseen = (owner >= 0) & ~is_counted
-    is_unseen &= (seen < SEEN_FRACTION * np.bincount(rows, minlength=shape[1]))[members.partition.ravel()]
+    is_unseen &= (seen < SAMPLED_FRACTION * np.bincount(rows, minlength=shape[1]))[members.partition.ravel()]
     cell, row = [*cell, owner[is_unseen]], [*row, members.partition.ravel()[is_unseen]]
     weight.append(np.ones(is_unseen.sum()))
     every = np.concatenate(weight), (np.concatenate(cell), np.concatenate(row))
