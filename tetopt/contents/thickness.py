@@ -23,6 +23,7 @@ from tetopt.geometry.vectors import cross, dot, minus, row, scaled
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
+THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # over its voxels, by which the thickness of a label is told
 THICKNESS_BYTES = 18.0  # at each voxel: chords, thickness, the labels, also those within a region
 BEYOND_REGION = -1  # in place of a label: beyond the region
 SLABS_PER_THREAD = 4  # of the grid for each thread: some take longer than others

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from difflib import get_close_matches
 from math import prod
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from tetopt.engine.loop import (
     START_K_D,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
+    Boundary,
     MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
@@ -47,11 +48,20 @@ from tetopt.system.budget import check_memory
 Mode = Literal["graded", "uniform", "paper", "start"]
 Run = Callable[..., MeshingResult]  # an optimisation that is ready to begin; takes further options of `optimize`
 
-MODE_DEFAULTS: dict[Mode, tuple[float, int]] = {  # k_D and iterations
-    "graded": (GRADED_K_D, GRADED_ITERATIONS),
-    "uniform": (UNIFORM_K_D, UNIFORM_ITERATIONS),
-    "paper": (UNIFORM_K_D, UNIFORM_ITERATIONS),
-    "start": (START_K_D, UNIFORM_ITERATIONS),
+
+class ModeDefaults(NamedTuple):
+    """Options of an optimisation that depend on the mode."""
+
+    k_D: float
+    iterations: int
+    boundary: Boundary = "slide"
+
+
+MODE_DEFAULTS: dict[Mode, ModeDefaults] = {
+    "graded": ModeDefaults(GRADED_K_D, GRADED_ITERATIONS),
+    "uniform": ModeDefaults(UNIFORM_K_D, UNIFORM_ITERATIONS),
+    "paper": ModeDefaults(UNIFORM_K_D, UNIFORM_ITERATIONS),
+    "start": ModeDefaults(START_K_D, UNIFORM_ITERATIONS, "fixed"),
 }
 MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run begins with
     "graded": ("nodes", "target_error", "sizes"),
@@ -181,10 +191,7 @@ def mesh_image(
         if nodes is None and target_error is None:
             nodes = values["nodes"] = _nodes_of(content, sizes, order)
     _check_mode(mode, content, values | {"sizes": sizes}, order)
-    default_k_D, default_iterations = MODE_DEFAULTS[mode]
-    options["k_D"] = default_k_D if k_D is None else k_D
-    options["iterations"] = default_iterations if iterations is None else iterations
-    options |= {"boundary": "fixed"} | options if mode == "start" else {}
+    options = _with_defaults(mode, options, k_D=k_D, iterations=iterations)
     sizes = sizes_of_order(content, nodes, sizes, order) if mode == "graded" else sizes
     seconds: list[float] = []
 
@@ -256,6 +263,11 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
     check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or allow more", limit)
     check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
+
+
+def _with_defaults(mode: Mode, options: dict[str, Any], **stated: Any) -> dict[str, Any]:
+    """The options of an optimisation and those that are stated, not None; else the defaults of the mode."""
+    return MODE_DEFAULTS[mode]._asdict() | options | {name: each for name, each in stated.items() if each is not None}
 
 
 def _check_names(options: dict[str, Any], optimisation: Run) -> None:

@@ -278,16 +278,16 @@ def _mode(job: JobOptions) -> Mode:
 
 def _completed(job: JobOptions, mode: Mode) -> JobOptions:
     """The engine's options with the defaults of the mode; InputError where they cannot be."""
-    k_D, iterations = MODE_DEFAULTS[mode]
-    k_D = k_D if job.k_D is None else job.k_D
-    iterations = iterations if job.iterations is None else job.iterations
+    default = MODE_DEFAULTS[mode]
+    k_D = default.k_D if job.k_D is None else job.k_D
+    iterations = default.iterations if job.iterations is None else job.iterations
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"`k_D`: expected 0 <= k_D < 1, got {k_D}")
     if job.max_seconds is not None and not job.max_seconds > 0.0:
         raise InputError(f"`max_seconds`: expected more than 0, got {job.max_seconds}")
     if job.max_gb is not None and not job.max_gb > 0.0:
         raise InputError(f"`max_gb`: expected more than 0, got {job.max_gb}")
-    boundary = job.boundary or ("fixed" if mode == "start" else "slide")
+    boundary = job.boundary or default.boundary
     job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary)
     _check_method(job, "paper", ("n_t", "retessellate"))
     _check_method(job, "fast", ("shape_power", "min_dihedral"))

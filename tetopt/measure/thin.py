@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
-from tetopt.contents.thickness import BEYOND_REGION, local_thickness, thickness_between
+from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, local_thickness, thickness_between
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
@@ -209,5 +209,5 @@ def _percentiles(
     for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
         if box is not None:
             own = thickness[box][rows[box] == row]
-            percentiles[int(values[row])] = Thickness(*np.percentile(own, [5.0, 50.0, 95.0]).astype(float).tolist())
+            percentiles[int(values[row])] = Thickness(*np.percentile(own, THICKNESS_PERCENTILES).astype(float).tolist())
     return percentiles

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
-from tetopt.contents.thickness import local_thickness
+from tetopt.contents.thickness import THICKNESS_PERCENTILES, local_thickness
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.start.octree import nodes_of_sizes
@@ -23,7 +23,6 @@ from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Si
 EVERY_LABEL = "*"  # all labels that have no size of their own
 SIZE_FORM = re.compile(r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?")
 DEFAULT_SIZED_NODES = 5000  # of the uniform mesh whose edges are the largest where neither nodes nor lengths are given
-THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # of its voxels, by which a label is told
 BELOW_FRACTION = 0.98  # of the cells asked for: where fewer lie across, a place counts as below
 SCALE_STEPS = 12  # of bisection for the factor by which a number of nodes makes sizes larger: to a thousandth
 LARGEST_SCALE = 64.0  # of that factor
@@ -292,9 +291,7 @@ def _largest(sizes: Sizes, content: Content, nodes: int | None) -> tuple[float, 
     return min(longest * USUAL_IN_BLOCK[n] / LONGEST_IN_BLOCK[n], NO_BOUND_MM), nodes is None
 
 
-def _thickness(
-    sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float
-) -> NDArray[np.float32]:  # fmt: skip
+def _thickness(sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float) -> NDArray[np.float32]:
     """The local thickness by voxel, mm, up to where sizes depend on it no more."""
     assert content.memberships is not None
     spacing = content.image.spacing
@@ -318,9 +315,7 @@ def _targets(
     return target
 
 
-def _layers(
-    sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray
-) -> list[LabelLayers]:  # fmt: skip
+def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray) -> list[LabelLayers]:
     """What each label gets, the thinnest first."""
     assert content.memberships is not None
     rows = []

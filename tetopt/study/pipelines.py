@@ -90,7 +90,7 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
         As `tetopt.mesh_image` and `tetopt.contents.content.content`.
     """
     seconds: dict[str, float] = {}
-    k_D, iterations = MODE_DEFAULTS[mode] if mode == "graded" else (job.k_D, job.iterations)
+    k_D, iterations = MODE_DEFAULTS[mode][:2] if mode == "graded" else (job.k_D, job.iterations)
     content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
     with _timed(seconds, "kernels"):
         prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
