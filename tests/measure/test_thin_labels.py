@@ -165,6 +165,10 @@ def test_tables_have_the_worst_five_alone():
     shown = texts(thin_table(rows, {rows[0].label: "bone [l]"}))
     worst = sorted(rows, key=lambda row: -row.one_layer_fraction)[:5]
     assert [int(row[0].split()[0]) for row in shown] == [row.label for row in worst]
+    assert (
+        texts(thin_table([rows[0]._replace(label=0, one_layer_fraction=1.0), *rows], {rows[0].label: "bone [l]"}))
+        == shown
+    )
     assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "1.00", "2.00", "3.00", "-", "-", "-")
     alike = [row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)) for row in rows]
     assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]

@@ -50,6 +50,23 @@ def test_lengths_and_slopes_by_label(slabs):
     assert target_of(made, labels, 2) == 9.0
 
 
+def test_background_has_no_cells_across_but_where_it_has_a_size(slabs):
+    content, labels = slabs
+    labels = np.where(labels == 2, 0, labels)  # a gap of 3 mm
+    image = tetopt.Image(labels.astype(float))
+    content = tetopt.content(image, image, weights=[0.0])
+    made = sizes_by_label(tetopt.Sizes(edge_size=9.0, cells_across=2), content)
+    assert target_of(made, labels, 0) == 9.0
+    assert target_of(made, labels, 3) == pytest.approx(4.0, abs=0.1)
+    assert [row.label for row in made.layers] == [3, 1, 0]
+    assert made.layers[-1].cells_across < 1.0
+    assert made.layers[-1].below == 0.0
+    made = sizes_by_label(tetopt.Sizes(edge_size=9.0, cells_across=2, by_label={0: "0.5t"}), content)
+    assert target_of(made, labels, 0) == pytest.approx(1.5, abs=0.05)
+    made = sizes_by_label(tetopt.Sizes(edge_size=9.0, cells_across=2, by_label={"*": 5.0}), content)
+    assert target_of(made, labels, 0) == 5.0
+
+
 def test_fewer_nodes_make_all_sizes_larger(slabs):
     content, _ = slabs
     asked = tetopt.Sizes(edge_size=9.0, cells_across=2)

@@ -24,7 +24,8 @@ LABEL_PALETTE = (
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
 LABEL_TINTS = (0.0, -0.4, 0.4)  # of the palette when it begins again: as it is, mixed with black, mixed with white
-BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
+BACKGROUND_LABEL = 0  # the label of what is no tissue
+BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 
 def check_labels(name: str, labels: Image) -> None:
@@ -77,5 +78,5 @@ def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
     rounds, place = np.divmod(labels - 1, len(palette))
     tint = np.array(LABEL_TINTS)[rounds % len(LABEL_TINTS)][:, None]
     mixed = (1.0 - np.abs(tint)) * palette[place] + np.maximum(tint, 0.0)
-    mixed[labels == 0] = hex_colour(BACKGROUND_COLOUR)
+    mixed[labels == BACKGROUND_LABEL] = hex_colour(BACKGROUND_COLOUR)
     return np.rint(255.0 * mixed) / 255.0

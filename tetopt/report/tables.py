@@ -8,6 +8,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.curving import Curving
 from tetopt.geometry.quadratic import node_count
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, Thickness
@@ -142,11 +143,14 @@ def _decimals(number: float, count: int) -> str:
 
 
 def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
-    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, of equal ones the thinnest."""
+    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, of equal ones the thinnest.
+
+    Label 0 is no tissue, and left out.
+    """
     table = new_table(
         "thin labels", "in one layer, %", "voxels, mm: 5 %", "50 %", "95 %", "cells, mm: 5 %", "50 %", "95 %"
     )
-    there = [row for row in rows if row.n_cells]
+    there = [row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL]
 
     def goodness(row: LabelFidelity) -> tuple[float, float, int]:
         return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label

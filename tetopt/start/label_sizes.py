@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
+from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.contents.thickness import THICKNESS_PERCENTILES, local_thickness
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -88,7 +89,7 @@ class LabelLayers(NamedTuple):
     cells_across : float
         The median of thickness over target.
     below : float
-        The fraction of its voxels across which there are fewer cells than asked for; 0 if no number is.
+        The fraction of its voxels across which there are fewer cells than asked for; 0 if no number is, as for label 0.
 
     Examples
     --------
@@ -118,7 +119,7 @@ class SizesByLabel(NamedTuple):
     scale : float
         By how much they are larger than asked for, as fewer nodes are to be had; 1 if they are not.
     layers : list of LabelLayers
-        A row for each label, the thinnest first.
+        A row for each label, the thinnest first, label 0 last.
 
     Examples
     --------
@@ -198,9 +199,9 @@ def parse_label_size(text: str | float) -> LabelSize:
 def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = None) -> SizesByLabel | None:
     """Targets by place from `cells_across` and `by_label` of sizes; None without them.
 
-    A place gets the smallest of: its label's size; its local thickness over `cells_across`; `field` and `edge_size`. It
-    is never below `smallest`. Without `edge_size`, places that are not thin get no target if `nodes` are given, and the
-    usual edge of a uniform mesh of 5,000 nodes else.
+    A place gets the smallest of: its label's size; its local thickness over `cells_across`, but in label 0, which is no
+    tissue; `field` and `edge_size`. It is never below `smallest`. Without `edge_size`, places that are not thin get no
+    target if `nodes` are given, and the usual edge of a uniform mesh of 5,000 nodes else.
 
     Parameters
     ----------
@@ -308,7 +309,9 @@ def _targets(
     assert content.memberships is not None
     target = np.minimum(sizes.on_voxels(content.image), largest).astype(np.float64)
     if sizes.cells_across is not None:
-        target = np.minimum(target, thickness / sizes.cells_across)
+        background = np.flatnonzero(content.memberships.labels == BACKGROUND_LABEL)
+        is_tissue = ~np.isin(content.memberships.partition, background)
+        np.minimum(target, thickness / sizes.cells_across, out=target, where=is_tissue)
     for row, rule in rules.items():
         is_label = content.memberships.partition == row
         target[is_label] = np.minimum(target[is_label], rule.at(thickness[is_label]))
@@ -316,7 +319,7 @@ def _targets(
 
 
 def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray) -> list[LabelLayers]:
-    """What each label gets, the thinnest first."""
+    """What each label gets, the thinnest first, the background last."""
     assert content.memberships is not None
     rows = []
     for row, label in enumerate(content.memberships.labels):
@@ -328,7 +331,8 @@ def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], targ
         thick, edge = thickness[is_label], target[is_label]
         low, middle, high = np.percentile(thick, THICKNESS_PERCENTILES)
         across = thick / edge
-        below = 0.0 if sizes.cells_across is None else float((across < BELOW_FRACTION * sizes.cells_across).mean())
+        number = 0.0 if sizes.cells_across is None or label == BACKGROUND_LABEL else sizes.cells_across
+        below = float((across < BELOW_FRACTION * number).mean())
         numbers = float(low), float(middle), float(high)
         rows.append(LabelLayers(int(label), numbers, float(np.median(edge)), float(np.median(across)), below))
-    return sorted(rows, key=lambda each: each.thickness)
+    return sorted(rows, key=lambda each: (each.label == BACKGROUND_LABEL, each.thickness))

@@ -73,10 +73,10 @@ class Sizes(NamedTuple):
         blocks on the box's faces.
     cells_across : float, optional
         So many cells lie across a label where it is thin: the target is its local thickness by as much
-        (`sizes_by_label`), not below `smallest` or a voxel.
+        (`sizes_by_label`), not below `smallest` or a voxel. Label 0 is background, and has no such target.
     by_label : mapping of int to float, str or LabelSize, optional
-        Targets by label, "*" for all others: mm, or a part of the local thickness t, "0.6t", or "0.6t[1:10]" between
-        bounds in mm.
+        Targets by label, "*" for all others, 0 among them: mm, or a part of the local thickness t, "0.6t", or
+        "0.6t[1:10]" between bounds in mm.
 
     Raises
     ------
