@@ -38,6 +38,9 @@ def test_files_of_mappings_are_relative_to_the_table(tmp_path):
     (row,) = read_table(path)
     mappings = {"young": str(tmp_path / "mapping.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
     assert row.options == mappings
+    labels = table(tmp_path / "l.tsv", "subject\timage\tmerge\tlabel_size", "1\ta.nii\tgroups.csv\tsizes.csv")
+    (other,) = read_table(labels)
+    assert other.options == {"merge": str(tmp_path / "groups.csv"), "label_size": str(tmp_path / "sizes.csv")}
     (tmp_path / "inner").mkdir()
     write_table(tmp_path / "inner" / "u.tsv", [row])
     assert "\t../../rho.TOML\t0.3\t../mapping.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()

@@ -11,9 +11,12 @@ import tetopt
 from tetopt import InputError, Job
 from tetopt.cli.options import from_records
 from tetopt.io.images import sha256
+from tetopt.job.inputs import label_sizes_of
 from tetopt.job.options import RunOptions, given_options
 from tetopt.job.request import checksum, requested
 from tetopt.job.texts import option_words, with_options
+from tetopt.model.labels import LabelTable
+from tetopt.start.label_sizes import LabelSize
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
@@ -78,6 +81,41 @@ def test_a_request_changes_with_what_decides_the_mesh(request_of, tmp_path):
     (tmp_path / "m.nii").write_text("another")
     others.append(request_of())
     assert len({first, *(each["sha256"] for each in others)}) == 5
+
+
+def test_a_table_of_labels_is_part_of_a_request_by_what_it_says(request_of, tmp_path):
+    sizes, groups = tmp_path / "sizes.csv", tmp_path / "groups.csv"
+    asked = {"labels": tmp_path / "m.nii", "label_size": str(sizes), "merge": str(groups)}
+    sums = set()
+    for size, group in (("1,2", "a,1"), ("1,2.5", "a,1"), ("1,2.5", "bone,1")):
+        sizes.write_text(size)
+        groups.write_text(group)
+        sums.add(request_of(**asked)["sha256"])
+    assert len(sums) == 3
+    assert sorted(request_of(**asked)["files"]) == ["images", "label-size", "labels", "mask", "merge"]
+
+
+def test_sizes_of_labels_in_a_file(tmp_path):
+    table = LabelTable({3: "fluid", 4: "bone"}, {})
+    file = tmp_path / "sizes.csv"
+    for text in (
+        "fluid,1.5\nbone,0.6t[1:10]\n*,6\n",
+        "name;size_mm;why\nfluid;1.5;thin\nbone;0.6t[1:10];\n*;6;\n",
+        "# mm\nLabel,Size\n3, 1.5\n4,0.6t[1:10]\n*,6",
+    ):
+        file.write_text(text)
+        sizes = label_sizes_of(str(file), table)
+        assert sizes == {3: LabelSize(1.5), 4: LabelSize(0.6, True, 1.0, 10.0), "*": LabelSize(6.0)}
+    for text, match in (
+        ("fluid,thin", 'sizes.csv: label_size: expected mm, .* got "thin"'),
+        ("fluid,1.5\nbrain,2", 'sizes.csv: label_size: no label is called "brain"; fluid, bone'),
+        ("fluid,1.5\n3,2", "sizes.csv: label_size: label 3 has two sizes"),
+        ("fluid", 'sizes.csv: expected rows of a name and what it has, got "fluid"'),
+        ("", "sizes.csv: label_size: expected"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=match):
+            label_sizes_of(str(file), table)
 
 
 def test_a_volume_of_a_file_is_part_of_a_request(request_of, tmp_path):

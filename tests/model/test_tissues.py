@@ -81,6 +81,37 @@ def test_a_file_of_groups(tmp_path):
             merge_labels(ROW, str(file))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        'name,labels\n# the tissues\nwhite,"2, 41"\ngrey,3,42\n5:soft,500-530\n5:soft, 7\n',
+        "tissue;label\nwhite;2,41\n\ngrey;3;42;\n5:soft;500-530,7",
+        "white\t2\ngrey\t3\nwhite\t41\ngrey\t42\n5:soft\t500-530\t7\n",
+    ],
+)
+def test_rows_of_groups(tmp_path, text):
+    file = tmp_path / "groups.CSV"
+    file.write_text(text)
+    assert merge_labels(ROW, str(file)).labels.data.tolist() == [[0.0, 1.0, 1.0, 2.0, 2.0, 5.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("white,2,41\ngrey", 'groups.csv: expected rows of a name and what it has, got "grey"'),
+        ("white,2\ngrey,", 'groups.csv: expected rows .* got "grey,"'),
+        ("white,2,41\ngrey,41", "`merge`: label 41 is in two groups, white and grey"),
+        ("name,labels\n", "groups.csv: `merge`: expected NAME=LABELS"),
+        ("5:white,2\n5:grey,41", "groups.csv: `merge`: expected another label for each group, got 5 twice"),
+    ],
+)
+def test_other_rows_are_refused(tmp_path, text, match):
+    file = tmp_path / "groups.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=match):
+        merge_labels(ROW, str(file))
+
+
 def test_presets_number_tissues_as_simnibs_does():
     for preset in ("aseg", "synthseg"):
         tissues = {group.label: group.name for group in groups_of(preset)}

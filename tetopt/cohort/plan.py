@@ -32,7 +32,7 @@ from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.job.texts import option_words, with_options
-from tetopt.model.tissues import FILES_IN_TEXTS
+from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
 
 class PlannedSubject(NamedTuple):
@@ -130,7 +130,7 @@ class _Plans:
     """Plans of subjects; options that several share are checked once."""
 
     def __init__(self, options: RunOptions, suffix: str) -> None:
-        mappings = {name: file_of(getattr(options, name) or "") for name, file_of in FILES_IN_TEXTS.items()}
+        mappings = {name: named_file(getattr(options, name) or "") for name in FILES_IN_TEXTS}
         # A worker may be started in another folder.
         placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
         self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.model.tissues import FILES_IN_TEXTS
+from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
 
@@ -222,8 +222,8 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
 
 def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
     """The files that the texts of a subject's options name."""
-    for name, file_of in FILES_IN_TEXTS.items():
-        if (file := file_of(options.get(name, ""))) is not None:
+    for name in FILES_IN_TEXTS:
+        if (file := named_file(options.get(name, ""))) is not None:
             yield name, file
 
 

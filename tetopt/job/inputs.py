@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -28,11 +27,13 @@ from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
+from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
-from tetopt.system.incoming import json_of, text_of, toml_of
+from tetopt.system.incoming import json_of, rows_of
 
 IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
+SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # of the column of sizes in a table
 NAMES_LISTED = 8  # a line's worth
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
@@ -205,14 +206,18 @@ def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable
 
 def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
     """Sizes by label, as an option or a file has them; names become numbers by a table of labels, if there is one."""
-    path = Path(text)
-    if path.suffix.lower() == ".toml":
-        text = ",".join(f"{name}={size}" for name, size in toml_of(path, "sizes").items())
-    elif path.suffix.lower() == ".csv":
-        text = ",".join("=".join(row[:2]) for row in csv.reader(text_of(path, "sizes").splitlines()) if row)
-    sizes = parse_label_sizes(text)
-    if table is None:
-        return sizes
+    file = named_file(text)
+    if file is not None:
+        text = ",".join(f"{name}={''.join(cells[:1])}" for name, cells in rows_of(file, "table of sizes", SIZE_HEADS))
+    try:
+        sizes = parse_label_sizes(text)
+        return sizes if table is None else _by_number(sizes, table)
+    except InputError as error:
+        raise error if file is None else InputError(f"{file}: {error}") from error
+
+
+def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int | str, LabelSize]:
+    """The sizes with labels' numbers for their names."""
     numbers = {name: label for label, name in table.names.items()}
     known = {name: size for name, size in sizes.items() if isinstance(name, int) or name in (*numbers, EVERY_LABEL)}
     if unknown := [name for name in sizes if name not in known]:

@@ -117,7 +117,8 @@ class RegionOptions:
         str | None,
         Option(
             "GROUPS",
-            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a file .toml.',
+            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a file of '
+            "these, .toml or .csv.",
         ),
     ] = None
     weights: Annotated[str | None, Option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (

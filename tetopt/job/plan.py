@@ -27,7 +27,8 @@ from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
-from tetopt.model.tissues import groups_of, merge_file
+from tetopt.model.mappings import named_file
+from tetopt.model.tissues import groups_of
 from tetopt.parts.division import Division
 from tetopt.parts.work import VolumeFile
 from tetopt.start.label_sizes import SizesByLabel
@@ -223,7 +224,7 @@ def _check_source(job: JobOptions) -> None:
                 raise InputError(f"`{name}`: there are no `labels`")
         if job.free_volumes:
             raise InputError("`free_volumes`: there are no `labels`")
-    if job.merge is not None and merge_file(job.merge) is None:
+    if job.merge is not None and named_file(job.merge) is None:
         groups_of(job.merge)
 
 

@@ -14,7 +14,7 @@ from tetopt.io.images import sha256
 from tetopt.io.stored_images import stored_checksum
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
-from tetopt.model.tissues import FILES_IN_TEXTS
+from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
 # Options on which no output depends: names of outputs, threads, and who works on parts.
 WITHOUT_SAY = (
@@ -54,8 +54,8 @@ def requested(job: JobOptions) -> dict[str, Any]:
 
 def _files(name: str, value: Any) -> list[Path]:
     """The files among an option's values."""
-    if name in FILES_IN_TEXTS:
-        return [] if (file := FILES_IN_TEXTS[name](value)) is None else [file]
+    if name.replace("-", "_") in FILES_IN_TEXTS:
+        return [] if (file := named_file(value)) is None else [file]
     if name == "tissues":
         return tissue_files(value)
     return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]

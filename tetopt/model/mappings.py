@@ -17,7 +17,8 @@ from tetopt.model.formula import parse_formula
 from tetopt.system.incoming import text_of, toml_of
 
 MAPPED_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a mapping
-MAPPING_SUFFIXES = (".toml", ".csv")  # of files that a mapping's text may name
+FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text may name a file
+NAMED_SUFFIXES = (".toml", ".csv")  # of that file
 
 ModulusMapping = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
 
@@ -208,7 +209,7 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     InputError
         As `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
     """
-    if (file := mapping_file(text)) is not None:
+    if (file := named_file(text)) is not None:
         return load_mapping(file, quantity)
     if "=" in text:
         return parse_labels(text)
@@ -218,9 +219,9 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
 
 
-def mapping_file(text: str) -> Path | None:
-    """The file that a mapping's text names; None if the text is the mapping."""
-    return Path(text) if text.lower().endswith(MAPPING_SUFFIXES) else None
+def named_file(text: str) -> Path | None:
+    """The file that the text of one of `FILES_IN_TEXTS` names; None if the text stands for itself."""
+    return Path(text) if text.lower().endswith(NAMED_SUFFIXES) else None
 
 
 def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabel:
@@ -276,7 +277,7 @@ def has_column(text: str, name: str) -> bool:
     InputError
         As `load_mapping`, of files.
     """
-    if (file := mapping_file(text)) is None:
+    if (file := named_file(text)) is None:
         return False
     try:
         return name in _columns(file)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +14,8 @@ from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.model.labels import labels_named
-from tetopt.model.mappings import MAPPED_OPTIONS, mapping_file
-from tetopt.system.incoming import toml_of
+from tetopt.model.mappings import named_file
+from tetopt.system.incoming import rows_of, toml_of
 
 REST = "*"  # all labels that no group names, but 0
 UNGROUPED_LISTED = 20  # labels in a message
@@ -66,7 +66,7 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
         Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N where one is
         N:NAME=LABELS. LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*`` for all that no
         group has; 0 stays 0 unless a group has it. Or the name of such a table: "aseg" (FreeSurfer), "synthseg",
-        "simnibs"; or a file .toml, of a line NAME = LABELS for each.
+        "simnibs"; or a file of these: .toml, with a line NAME = LABELS for each, or .csv, with rows NAME,LABELS.
     names : dict of int to str, optional
         What the image's labels are called, for groups that list names.
 
@@ -127,17 +127,6 @@ def is_preset(merge: str) -> bool:
     return merge.strip() in _presets()
 
 
-def merge_file(merge: str) -> Path | None:
-    """The file that a text names; None if it is the groups, or a preset's name."""
-    return Path(merge) if merge.lower().endswith(".toml") else None
-
-
-FILES_IN_TEXTS: dict[str, Callable[[str], Path | None]] = {
-    **dict.fromkeys(MAPPED_OPTIONS, mapping_file),
-    "merge": merge_file,
-}  # options whose text may name a file, and the file that it names
-
-
 def groups_of(merge: str) -> list[LabelGroup]:
     """The groups of a text as `merge_labels` takes it.
 
@@ -146,20 +135,22 @@ def groups_of(merge: str) -> list[LabelGroup]:
     InputError
         A text of another kind; a name or a number twice; a file that cannot be read.
     """
-    if (file := merge_file(merge)) is not None:
+    if (file := named_file(merge)) is not None:
         try:
-            return _of_table(toml_of(file, "table of groups of labels"))
+            return _of_rows(rows_of(file, "table of groups of labels", ("label", "labels")))
         except InputError as error:
             raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
     if is_preset(merge):
-        return _of_table(_presets()[merge.strip()])
+        return _of_rows([(name, [labels]) for name, labels in _presets()[merge.strip()].items()])
     return _checked([_of_words(words) for words in merge.split(";") if words.strip()])
 
 
-def _of_table(table: Mapping[str, Any]) -> list[LabelGroup]:
-    """The groups of a table, one for each key."""
-    rows = {name: value if isinstance(value, list) else [value] for name, value in table.items()}
-    return _checked([_of_words(f"{name}={','.join(map(str, values))}") for name, values in rows.items()])
+def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
+    """The groups of rows of a name and its labels, those of one name together."""
+    groups: dict[str, list[object]] = {}
+    for name, labels in rows:
+        groups.setdefault(name, []).extend(labels)
+    return _checked([_of_words(f"{name}={','.join(map(str, labels))}") for name, labels in groups.items()])
 
 
 def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
@@ -169,7 +160,7 @@ def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
     if match is None or not all(members):
         raise InputError(
             f'`merge`: expected NAME=LABELS, separated by semicolons, such as "white=2,41; grey=3,42; soft=500-530", a '
-            f'file .toml, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
+            f'file .toml or .csv, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
         )
     return match[1], " ".join(match[2].split()), members
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,34 @@ def toml_of(path: str | Path, noun: str) -> dict[str, Any]:
     except RecursionError as error:
         raise InputError(f"{path}: expected TOML, got brackets nested too deeply") from error
     return table
+
+
+def rows_of(path: Path, noun: str, heads: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Names and what each has, of TOML's keys or of rows of CSV, between commas, semicolons or tabs.
+
+    In CSV the separator is the first of these that there is. Lines that are empty or begin with # are left out, and so
+    is a first row whose second cell is one of `heads`.
+
+    Raises
+    ------
+    InputError
+        As `toml_of` or `text_of`; a row of one cell alone.
+    """
+    if path.suffix.lower() == ".toml":
+        table = toml_of(path, noun)
+        return [(name, list(map(str, each if isinstance(each, list) else [each]))) for name, each in table.items()]
+    text = text_of(path, noun)
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    separator = next((letter for letter in "".join(lines) if letter in ",;\t"), ",")
+    try:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)]
+    except csv.Error as error:
+        raise InputError(f"{path}: expected rows of a {noun}, got {_short(error)}") from error
+    if rows and rows[0][1:] and rows[0][1].lower() in heads:
+        del rows[0]
+    if short := [row for row in rows if not "".join(row[1:])]:
+        raise InputError(f'{path}: expected rows of a name and what it has, got "{separator.join(short[0])[:80]}"')
+    return [(row[0], [cell for cell in row[1:] if cell]) for row in rows]
 
 
 def json_of(text: str) -> Any:
