@@ -126,6 +126,13 @@ def test_numbers_are_those_of_the_meshes(run, head):
             for name in ("area_ratio", "folded", "nonmanifold_edges", "nonmanifold_edges_two_labels"):
                 value = getattr(surface, name)
                 assert row[name] == (None if np.isnan(value) else pytest.approx(value))  # nan where no cell has it
+        contacts = tetopt.label_contacts(labels, mesh, of_cell)
+        for row, of_label in zip(median["labels"], tetopt.label_fidelity(labels, mesh, of_cell), strict=True):
+            part = of_label.one_layer_fraction
+            assert row["one_layer_fraction"] == (None if np.isnan(part) else pytest.approx(part))
+            own = [each for each in contacts if row["label"] in each.labels]
+            excess = sum(max(each.mesh_mm2 - 1.2 * each.voxels_mm2, 0.0) for each in own)
+            assert row["excess_contact_mm2"] == pytest.approx(excess)
         assert sum(row["E_D_fraction"] for row in median["labels"]) == pytest.approx(median["E_D_fraction"], rel=1e-9)
 
 

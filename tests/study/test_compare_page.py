@@ -51,6 +51,7 @@ def fake_run(seed, scale, order=1):
             components=1, mesh_components=int(random.integers(1, 4)) * (k < 3),
             area_ratio=some(0.9, 1.8) if k < 3 else None, folded=some(0.0, 0.5) if k < 3 else None,
             nonmanifold_edges=10 * k, nonmanifold_edges_two_labels=5 * k,
+            one_layer_fraction=some(0.1, 0.9) if k < 3 else None, excess_contact_mm2=some(0.0, 200.0),
         )
         for k in range(4)
     ]  # fmt: skip
@@ -382,7 +383,7 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
 
 
 def folded_tables(parsed):
-    """Of the labels' connected components, and of their fractions of E_D."""
+    """Of the labels' connected components, single layers and contact, and of their fractions of E_D."""
     return [
         table
         for table in parsed.tables
@@ -394,7 +395,7 @@ def lose(run, label):
     labels = run.measurement.labels
     labels[label] = labels[label]._replace(
         is_lost=True, dice=0.0, surface_mean_mm=None, surface_p95_mm=None, mesh_volume_mm3=0.0, area_ratio=None,
-        folded=None,
+        folded=None, one_layer_fraction=None,
     )  # fmt: skip
 
 
@@ -429,12 +430,17 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
             assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
-    pieces, fractions = folded_tables(parsed)
+    pieces, layers, contacts, fractions = folded_tables(parsed)
+    assert "straight cells" in page
     for k in range(4):
         for column, pipeline in enumerate(done, 2):
             of_runs = [run.measurement.labels[k] for run in pipeline.runs]
             assert float(pieces[k + 1][column][1][0]) == np.median([row.mesh_components for row in of_runs])
             assert close(fractions[k + 1][column][1][0], np.median([row.E_D_fraction for row in of_runs]))
+            assert close(contacts[k + 1][column][1][0], np.median([row.excess_contact_mm2 for row in of_runs]))
+            known = [row.one_layer_fraction for row in of_runs if not row.is_lost]
+            text = layers[k + 1][column][1][0]
+            assert close(text, np.median(known)) if known else text == "–"
 
 
 def test_most_of_many_labels_are_folded(tmp_path):

@@ -37,6 +37,7 @@ from tetopt.job.events import note
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
+from tetopt.measure.thin import contact_totals, label_contacts
 from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.fields import cell_fields
@@ -227,7 +228,7 @@ def _label_rows(
     means: NDArray[np.float64],
     owner: NDArray[np.int64],
 ) -> list[records.LabelRow]:
-    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, the voxels of its cells, E_D's fraction."""
+    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, contact, voxels of its cells, E_D in it."""
     of_voxels = cell_labels(standard.labels, mesh)
     of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
     label = standard.labels.data.ravel().astype(np.int64)
@@ -236,6 +237,7 @@ def _label_rows(
     h = standard.image.data.ravel().astype(np.float64)
     squares = np.bincount(label, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
     total = float(((h - h.mean()) ** 2).sum())
+    contacts = label_contacts(standard.labels, mesh, of_cell)
     return [
         records.LabelRow(
             label=row.label, voxels=row.voxels, mesh_voxels=int(painted[row.label]), dice=row.dice,
@@ -245,6 +247,8 @@ def _label_rows(
             components=row.components, mesh_components=row.mesh_components,
             area_ratio=surface.area_ratio, folded=surface.folded, nonmanifold_edges=surface.nonmanifold_edges,
             nonmanifold_edges_two_labels=surface.nonmanifold_edges_two_labels,
+            one_layer_fraction=row.one_layer_fraction,
+            excess_contact_mm2=contact_totals([each for each in contacts if row.label in each.labels])["excess_mm2"],
         )
         for row, surface in zip(
             label_fidelity(standard.labels, mesh, of_cell), label_interfaces(standard.labels, mesh, of_cell),

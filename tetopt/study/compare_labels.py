@@ -12,7 +12,8 @@ from tetopt.study.compare_report import PipelineResult, Report
 
 # Of `LabelRow`: what is shown of each label, besides the error of its volume.
 SHOWN_FIELDS = (
-    "dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_fraction", "area_ratio", "folded"
+    "dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_fraction", "area_ratio", "folded",
+    "one_layer_fraction", "excess_contact_mm2",
 )  # fmt: skip
 
 
@@ -61,6 +62,8 @@ def labels_of(report: Report) -> dict[str, Any] | None:
         "vanished": [(title, rows) for title, rows in zip(titles, lost, strict=True) if rows],
         "components": [["label", "in the image", *titles], *_rows(lines, components, "mesh_components")],
         "fractions": [["label", "voxels", *titles], *_rows(lines, voxels_by_label(report), "E_D_fraction")],
+        "layers": [["label", "voxels", *titles], *_rows(lines, voxels_by_label(report), "one_layer_fraction")],
+        "contacts": [["label", "voxels", *titles], *_rows(lines, voxels_by_label(report), "excess_contact_mm2")],
     }
 
 

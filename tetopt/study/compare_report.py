@@ -92,6 +92,8 @@ class LabelRow(NamedTuple):
     folded: float | None
     nonmanifold_edges: int
     nonmanifold_edges_two_labels: int
+    one_layer_fraction: float | None  # None where no cell has it
+    excess_contact_mm2: float  # with all other labels, over 1.2 times the voxels'
 
 
 class Solved(NamedTuple):
