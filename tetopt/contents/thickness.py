@@ -3,8 +3,9 @@
 The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67), between the smooth surfaces of labels
 (`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5 voxels has 1.5, where distances of voxels'
 centres would give 1 or 2. At a voxel in the middle of its label the diameter is the shortest of the 13 chords
-through it along axes and diagonals, each of which ends where another label's level is as small. Between facets it is
-the same, but that a chord ends where it crosses one.
+through it along axes and diagonals, each of which ends where another label's level is as small; times the cosine of
+its angle with the surfaces' normals, in the mean of both ends. Between facets it is the same, but that a chord ends
+where it crosses one.
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ from tetopt.system.kernel_cache import njit
 
 THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # over its voxels, by which the thickness of a label is told
 THICKNESS_BYTES = 18.0  # at each voxel: chords, thickness, the labels, also those within a region
+CROSSING_BYTES = 2.0  # of each step
 BEYOND_REGION = -1  # in place of a label: beyond the region
 SLABS_PER_THREAD = 4  # of the grid for each thread: some take longer than others
-NO_CROSSING = 255  # of a step that no facet crosses
+NO_CROSSING = 2**16 - 1  # of a step that no facet crosses
+COSINE_STEPS = 256  # of a cosine; a crossing has as many steps, and is their multiple
+LEAST_COSINE = 0.75  # between the shortest chord and a normal; less is at a crease, where there is none
 BESIDE_FRACTION = 1e-9  # of a triangle's size: so far beside it counts as in it
 OFF_MIDDLE_STEPS = 1.01  # by which the two ways along the shortest chord through a middle differ at most
 
@@ -38,7 +42,8 @@ class _Labels(NamedTuple):
     partition: NDArray[np.int16]  # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to stay in caches
     levels: NDArray[np.float32]  # (C, s_0, s_1, s_2)
     channel: NDArray[np.int64]  # (K,)
-    crossing: NDArray[np.uint8]  # (D, s_0, s_1, s_2) where facets cross each step up, 0 to 254; or without levels only
+    # (D, s_0, s_1, s_2) where facets cross each step up, 0 to 254, times 256, and the cosine of their angle, 0 to 255;
+    crossing: NDArray[np.uint16]  # empty where there are levels
 
 
 def local_thickness(
@@ -70,7 +75,7 @@ def local_thickness(
     check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
     partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
-    no_crossing = np.zeros((0, 1, 1, 1), dtype=np.uint8)
+    no_crossing = np.zeros((0, 1, 1, 1), dtype=np.uint16)
     levels = members.levels.reshape(-1, *whole)
     return _thickness(partition, levels, members.channel, no_crossing, spacing, most)
 
@@ -104,12 +109,14 @@ def thickness_between(
     shape, n = partition.shape, partition.ndim
     whole = (1,) * (3 - n) + shape
     (steps, _), edges = _rays(spacing)
-    check_memory((THICKNESS_BYTES + len(steps)) * partition.size, "thickness of labels", "crop the image")
+    check_memory(
+        (THICKNESS_BYTES + CROSSING_BYTES * len(steps)) * partition.size, "thickness of labels", "crop the image"
+    )
     if n == 2:  # a segment is a rectangle across the plane, of two triangles
         flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
         flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and the second
         corners = np.concatenate([flat[:, :3], flat[:, 1:]])
-    crossing = np.full((len(steps), *whole), NO_CROSSING, dtype=np.uint8)
+    crossing = np.full((len(steps), *whole), NO_CROSSING, dtype=np.uint16)
     _over_slabs(lambda slab: _fill_crossings(crossing, corners, steps * edges, edges, slab[3 - n], 3 - n), whole, n)
     no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
     return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), crossing, spacing, most)
@@ -117,7 +124,7 @@ def thickness_between(
 
 def _thickness(
     partition: NDArray[np.int64], levels: NDArray[np.float32], channel: NDArray[np.int64],
-    crossing: NDArray[np.uint8], spacing: NDArray[np.float64], most: float,
+    crossing: NDArray[np.uint16], spacing: NDArray[np.float64], most: float,
 ) -> NDArray[np.float32]:  # fmt: skip
     """`local_thickness` of labels by row, -1 beyond the region, between levels or crossings on a grid in space."""
     n = partition.ndim
@@ -125,7 +132,7 @@ def _thickness(
     labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, crossing)
     rays, edges = _rays(spacing)
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
-    _over_slabs(lambda slab: _fill_chords(chord, is_middle, labels, rays, most, slab), whole, n)
+    _over_slabs(lambda slab: _fill_chords(chord, is_middle, labels, (*rays, edges), most, slab), whole, n)
     thickness = chord.copy()
     _spread_balls(thickness, chord, is_middle, labels.partition, edges)
     return thickness.reshape(partition.shape)
@@ -150,24 +157,29 @@ def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_chords(
-    chord: NDArray, is_middle: NDArray, labels: _Labels, rays: tuple[NDArray, NDArray], most: float,
+    chord: NDArray, is_middle: NDArray, labels: _Labels, rays: tuple[NDArray, NDArray, NDArray], most: float,
     slab: tuple[tuple[int, int], ...],
 ) -> None:  # fmt: skip
-    """The shortest chord through each voxel of a slab, and whether it is in the middle of it."""
-    steps, lengths = rays
+    """The shortest chord through each voxel of a slab, across its surfaces, and whether it is in the middle of it."""
+    steps, lengths, edges = rays
     for i in range(*slab[0]):
         for j in range(*slab[1]):
             for k in range(*slab[2]):
                 if labels.partition[i, j, k] < 0:
                     continue
-                least, off_middle = most, np.inf
+                least, off_middle, shortest = most, np.inf, -1
                 for d in range(len(steps)):
                     forth = _way(labels, (i, j, k), (d, steps[d]), lengths[d], least)
                     if forth >= least:
                         continue
                     back = _way(labels, (i, j, k), (-1 - d, -steps[d]), lengths[d], least - forth)
                     if forth + back < least:
-                        least, off_middle = forth + back, abs(forth - back) / lengths[d]
+                        least, off_middle, shortest = forth + back, abs(forth - back) / lengths[d], d
+                if shortest >= 0:
+                    step, length = steps[shortest], lengths[shortest]
+                    forth = _cosine(labels, (i, j, k), (shortest, step), length, edges)
+                    back = _cosine(labels, (i, j, k), (-1 - shortest, -step), length, edges)
+                    least *= 0.5 * (forth + back)
                 chord[i, j, k] = least
                 is_middle[i, j, k] = off_middle <= OFF_MIDDLE_STEPS
 
@@ -195,7 +207,7 @@ def _way(
             part = crossing[d, i, j, k] if d >= 0 else crossing[-1 - d, a, b, c]
             if part == NO_CROSSING:  # cells that overlap
                 return way + 0.5 * length
-            fraction = part / (NO_CROSSING - 1.0)
+            fraction = (part // COSINE_STEPS) / (COSINE_STEPS - 2.0)
             return float(way + length * (fraction if d >= 0 else 1.0 - fraction))
         if other != own:
             here = levels[channel[other], i, j, k] - levels[channel[own], i, j, k]
@@ -203,6 +215,40 @@ def _way(
             return float(way + length * here / max(here + there, 1e-6))
         i, j, k, way = a, b, c, way + length
     return way
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cosine(
+    labels: _Labels, place: tuple[int, int, int], direction: tuple[int, NDArray], length: float, edges: NDArray
+) -> float:
+    """Of the angle between a way to the label's surface, as of `_way`, and the normal there; 1 where that is unknown.
+
+    Between levels the normal is along the gradient of the other label's.
+    """
+    partition, levels, channel, crossing = labels
+    (i, j, k), (d, step) = place, direction
+    a, b, c = i + step[0], j + step[1], k + step[2]
+    while True:
+        is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
+        if not is_in or partition[a, b, c] < 0:  # a sum of two ways may be rounded to below one that leaves the grid
+            return 1.0
+        if partition[a, b, c] != partition[i, j, k]:
+            break
+        i, j, k, a, b, c = a, b, c, a + step[0], b + step[1], c + step[2]
+    if len(crossing) > 0:
+        part = crossing[d, i, j, k] if d >= 0 else crossing[-1 - d, a, b, c]
+        return 1.0 if part == NO_CROSSING else max((part % COSINE_STEPS) / (COSINE_STEPS - 1.0), LEAST_COSINE)
+    level, at = levels[channel[partition[a, b, c]]], (a, b, c)
+    along, square = 0.0, 0.0
+    for axis in range(3):
+        low = at[axis] - (1 if at[axis] > 0 else 0)
+        high = at[axis] + (1 if at[axis] + 1 < level.shape[axis] else 0)
+        above = level[high if axis == 0 else a, high if axis == 1 else b, high if axis == 2 else c]
+        below = level[low if axis == 0 else a, low if axis == 1 else b, low if axis == 2 else c]
+        slope = (above - below) / (max(high - low, 1) * edges[axis])
+        along += slope * step[axis] * edges[axis]
+        square += slope * slope
+    return max(abs(along) / (length * np.sqrt(square)), LEAST_COSINE) if square > 0.0 else 1.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -233,9 +279,12 @@ def _fill_crossings(
 ) -> None:
     """Where triangles cross the ways (D, 3), mm, up from voxels' centres, the first of each; in a slab across an axis.
 
+    With the cosine of the angle between way and normal (`_Labels`).
+
     A triangle's height over a place is counted in lengths of its normal, which is no unit vector.
     """
     first, last, rise = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(len(ways))
+    lengths = np.sqrt((ways * ways).sum(axis=1))
     for facet in range(len(corners)):
         a, b, c = row(corners[facet], 0), row(corners[facet], 1), row(corners[facet], 2)
         for d in range(3):
@@ -246,7 +295,7 @@ def _fill_crossings(
         normal = cross(u, v)
         for s in range(len(ways)):
             rise[s] = dot(normal, row(ways, s))
-        steepest = np.abs(rise).max()
+        steepest, size = np.abs(rise).max(), np.sqrt(dot(normal, normal))
         for i in range(first[0], last[0] + 1):
             for j in range(first[1], last[1] + 1):
                 for k in range(first[2], last[2] + 1):
@@ -259,8 +308,9 @@ def _fill_crossings(
                             continue
                         t = -height / rise[s]
                         if _is_within(minus(place, scaled(-t, row(ways, s))), u, v):
-                            part = np.uint8((NO_CROSSING - 1) * t + 0.5)
-                            crossing[s, i, j, k] = min(crossing[s, i, j, k], part)
+                            part = COSINE_STEPS * int((COSINE_STEPS - 2) * t + 0.5)
+                            part += int((COSINE_STEPS - 1) * min(abs(rise[s]) / (size * lengths[s]), 1.0) + 0.5)
+                            crossing[s, i, j, k] = min(crossing[s, i, j, k], np.uint16(part))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,8 +1,8 @@
 """Thin labels: their local thickness, and the contact of each two labels, in voxels and mesh.
 
 Thickness is measured at the same voxel centres in both, between the labels' smooth surfaces and between the facets of
-the mesh, along the same 13 directions. These make it up to 8 % too large in cubic voxels (25 % where one edge is twice
-another), alike in both. A sheet that no voxel's centre lies in is not seen.
+the mesh, alike in both: the median of shells is within 3 % from voxels, 0.5 % from facets. A sheet that no voxel's
+centre lies in is not seen.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def label_thickness(
     >>> result = tetopt.mesh_image(what, 300, iterations=4)
     >>> voxels, cells = tetopt.label_thickness(what, result.mesh, result.labels)[1]
     >>> f"{voxels.p50:.0f} mm of voxels, {cells.p50:.0f} mm of cells"
-    '39 mm of voxels, 37 mm of cells'
+    '37 mm of voxels, 36 mm of cells'
     """
     of_cell = checked_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image

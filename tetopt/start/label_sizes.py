@@ -97,7 +97,7 @@ class LabelLayers(NamedTuple):
     >>> content = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
     >>> made = tetopt.sizes_by_label(tetopt.Sizes(edge_size=20.0, by_label={1: 8.0}), content)
     >>> [(row.label, row.edge) for row in made.layers]
-    [(0, 20.0), (1, 8.0)]
+    [(1, 8.0), (0, 20.0)]
     """
 
     label: int
