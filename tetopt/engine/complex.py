@@ -39,6 +39,7 @@ from tetopt.system.kernels import (
 
 # A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
 FLAT_FRACTION = 1e-7
+NODE_ROWS = ("ticks", "is_frozen", "meeting", "band")  # of a `Complex`: one row for each node
 CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # of a `Complex`: one row for each cell
 
 
@@ -48,6 +49,7 @@ class Complex(NamedTuple):
     ticks: Ints2  # (N, 3) node positions on the sampling grid
     is_frozen: Bools2  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
     meeting: Ints2  # (N, 4) labels of the cells around each node, where there are two or more; else -1
+    band: Floats1  # (N,) how far each node may be off the surface between two labels, voxels
     cells: Ints2  # (C, n+1) corners, positively oriented in the world
     labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 as long as none are given
     across: Ints2  # (C, n+1) the cell beyond each facet; -1 outside
@@ -78,6 +80,7 @@ class Objective(NamedTuple):
     own_column: Ints1  # (K,) for each label the column of a cell's sums that is its channel's
     own_value: Floats1  # (K,) and its value there; 0 in the other channels of labels
     bias: Floats1  # (K,) what a label is worth besides, as a fraction of a cell's voxels; see `tetopt.engine.labelling`
+    shift: Floats1  # (K,) how far out each label's surface is, in its level, voxels; see `tetopt.engine.interfaces`
     tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 
@@ -117,6 +120,7 @@ def build(
         ticks,
         is_frozen,
         np.full((len(ticks), 4), -1, dtype=np.int64),
+        np.zeros(len(ticks)),
         np.full((room, n_corners), -1, dtype=np.int64),
         np.zeros(room, dtype=np.int64),
         np.full((room, n_corners), -1, dtype=np.int64),

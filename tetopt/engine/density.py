@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
+    NODE_ROWS,
     NodeStars,
     State,
     cell_cosine,
@@ -188,7 +189,9 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
     is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
     meeting = np.concatenate([state.complex.meeting, np.full((n_nodes, 4), -1, dtype=np.int64)])
-    return state._replace(complex=state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting))
+    band = np.concatenate([state.complex.band, np.zeros(n_nodes)])
+    complex_ = state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting, band=band)
+    return state._replace(complex=complex_)
 
 
 def compacted(
@@ -207,7 +210,8 @@ def compacted(
     is_touched = np.zeros(len(kept), dtype=bool)
     is_touched[cells[is_dirty[:n_cells]]] = True
     old = state.complex
-    complex_ = old._replace(ticks=old.ticks[kept], is_frozen=old.is_frozen[kept], meeting=old.meeting[kept])
+    nodes = {name: getattr(old, name)[kept] for name in NODE_ROWS}
+    complex_ = old._replace(**nodes)
     source = np.where(kept < n_before, kept, -1)
     return Exchanged(state._replace(complex=complex_), source, is_touched, n_split, n_collapsed)
 

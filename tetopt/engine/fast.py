@@ -44,7 +44,7 @@ from tetopt.engine.requirements import checked
 from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.simplex import regular_edge, volumes
 from tetopt.image import Image, transformed
 from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
@@ -421,6 +421,7 @@ class Run:
         ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
         self.state = with_balance(self.state, self.content, self.mesh())
         relabel(self.state)
+        self._set_band()
         lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:
             lowest = max(lowest, self.state.objective.angle_limit)
@@ -428,6 +429,12 @@ class Run:
         is_other = (self.state.complex.ticks != ticks).any(axis=1)[self.cells].any(axis=1)
         is_other |= (self.state.complex.labels != labels)[: self.n_cells]
         self.hope[self.cells[is_other]] = np.inf
+
+    def _set_band(self) -> None:
+        """Say how far nodes may be off the surface between two labels."""
+        assert self.content.smooth is not None
+        step = self.image.voxel_volume ** (1.0 / self.n)
+        self.state.complex.band[:] = self.content.smooth.band * self.edge / step
 
     def keep_min_dihedral(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
@@ -562,7 +569,7 @@ def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.
     n, around = points.shape[1], cells.ravel()
     total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))
     mean = total / np.maximum(np.bincount(around, minlength=len(points)), 1)
-    return (2.0**0.5 * 6.0 * mean) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * mean) ** 0.5
+    return regular_edge(mean, n)
 
 
 def check_options(

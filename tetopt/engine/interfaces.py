@@ -28,7 +28,7 @@ from tetopt.engine.labelling import (
 )
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -39,6 +39,9 @@ SAMPLED_FRACTION = 0.5  # of a label's voxels: of one that samples show less of 
 SAMPLED_AT_ONCE = 100_000  # cells: 50 MB of places
 BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
 SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
+SPARED_LOSS_FRACTION = 0.08  # of a label's volume: to make up for all of it where it is left costs its place, Dice
+SHIFT_STEP = 0.5  # of what would make up for the volume
+MOST_SHIFT_FRACTION = 0.2  # of the edge beside a label's surface
 RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
 LEAST_RELABELLING_FRACTION = 1e-9  # of the energies weighed: a smaller gain may be rounding
 
@@ -51,7 +54,7 @@ def with_labels(
     `components` are those of the labels' voxels (`voxel_components`), if they are known. Labels that cells have already
     say what volume each label has lost or won, and its bias is brought up to date.
     """
-    members, tension, own_channel, own_value, keeps_volumes = smooth
+    members, tension, own_channel, own_value, keeps_volumes, _ = smooth
     bias = None if keeps_volumes else np.zeros(len(members.labels))
     components = components or voxel_components(members.partition, len(members.labels))
     if len(state.objective.bias) > 0:
@@ -68,6 +71,7 @@ def with_labels(
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
         bias=made.bias,
+        shift=state.objective.shift if len(state.objective.shift) > 0 else np.zeros(len(made.bias)),
         tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
@@ -77,7 +81,11 @@ def with_labels(
 
 
 def with_balance(state: State, content: Content, mesh: Mesh) -> State:
-    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are kept."""
+    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are kept.
+
+    What cells of the label cannot make up for, since nodes on its surface cut off what is round, its surface does,
+    which goes outwards by a shift of the label's level.
+    """
     if content.smooth is None or not content.smooth.keeps_volumes:
         return state
     members = content.smooth.memberships
@@ -87,7 +95,27 @@ def with_balance(state: State, content: Content, mesh: Mesh) -> State:
     volume = np.bincount(state.complex.labels[: len(size)], size, len(members.labels))
     is_small = np.abs(volume - aim) < SMALL_LOSS_FRACTION * aim
     bias = balanced(np.where(is_small, BALANCE_LEAK, 1.0) * state.objective.bias, aim, volume)
-    return state._replace(objective=state.objective._replace(bias=bias))
+    shift = state.objective.shift
+    if content.smooth.band > 0.0:
+        spared = np.sign(aim - volume) * np.maximum(np.abs(aim - volume) - SPARED_LOSS_FRACTION * aim, 0.0)
+        shift = _shifted(shift, spared, state, mesh, content.image.voxel_volume ** (1.0 / content.image.ndim))
+    return state._replace(objective=state.objective._replace(bias=bias, shift=shift))
+
+
+def _shifted(
+    shift: NDArray[np.float64], missing: NDArray[np.float64], state: State, mesh: Mesh, step: float
+) -> NDArray[np.float64]:
+    """How far out labels' surfaces are, (K,) voxels of `step` mm, to give labels the volume that is missing, mm^n."""
+    labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
+    is_between = (across >= 0) & (labels[across] != labels[:, None])
+    beside, n = np.flatnonzero(is_between.any(axis=1)), mesh.points.shape[1]
+    label, cells, n_labels = labels[beside], mesh.cells[beside], len(shift)
+    area = np.bincount(label, (facet_areas(mesh.points, cells) * is_between[beside]).sum(axis=1), n_labels)
+    number = np.maximum(np.bincount(label, minlength=n_labels), 1)
+    size = np.bincount(label, np.abs(volumes(mesh.points, cells)), n_labels) / number
+    most = MOST_SHIFT_FRACTION * regular_edge(size, n) / step
+    way = SHIFT_STEP * missing / np.where(area > 0.0, area * step, np.inf)
+    return np.asarray(np.clip(shift + way, -most, most))
 
 
 def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh) -> None:

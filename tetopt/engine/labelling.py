@@ -28,7 +28,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import has_node
-from tetopt.geometry.simplex import facet_areas, volumes
+from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
@@ -261,7 +261,7 @@ def _dual(
     tension = np.full(across.shape, weight)
     if weight is None:
         # The edge of a regular cell of that volume: thin cells do not make a surface dear.
-        edge = (size * (6.0 * np.sqrt(2.0) if n == 3 else 4.0 / np.sqrt(3.0))) ** (1.0 / n)
+        edge = regular_edge(size, n)
         tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
     tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
     voxel = size.sum() / counts.sum()

@@ -193,6 +193,8 @@ def mesh_image(
     _check_mode(mode, content, values | {"sizes": sizes}, order)
     options = _with_defaults(mode, options, k_D=k_D, iterations=iterations)
     sizes = sizes_of_order(content, nodes, sizes, order) if mode == "graded" else sizes
+    if order == 2 and content.smooth is not None:  # curved edges cut nothing off: corners are on the surface, too
+        content = content._replace(smooth=content.smooth._replace(band=0.0))
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> MeshingResult:

@@ -45,6 +45,7 @@ from tetopt.engine.complex import (
     wrong_side,
 )
 from tetopt.engine.surface import (
+    band_of,
     combined_ways,
     is_on_surface,
     normals_at,
@@ -574,7 +575,8 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
     if has_image:
         _add_image_gradient(g, H, state, stars, node)
     is_sliding = slides(normal, state, node)
-    step = _sliding_step(normal, g, node, state) if is_sliding else _newton_step(g, H, node, state)
+    is_bound = is_sliding and not band_of(state, node) > 0.0
+    step = _sliding_step(normal, g, node, state) if is_bound else _newton_step(g, H, node, state)
     moved, slope = times(state.objective.matrix, step), g[0] * step[0] + g[1] * step[1] + g[2] * step[2]
     square = dot(moved, moved)  # mm^2
     if not (square > 0.0 and slope < 0.0):

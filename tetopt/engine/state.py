@@ -139,6 +139,7 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
         own_column=np.zeros(0, dtype=np.int64),
         own_value=np.zeros(0),
         bias=np.zeros(0),
+        shift=np.zeros(0),
         tension=0.0,
     )
 

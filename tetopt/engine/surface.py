@@ -18,6 +18,7 @@ OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and 
 ASIDE_VOXELS = 0.25  # on either side of a place: where the level is taken for its slope
 MOST_MEETING = 4  # labels whose levels a node is brought to; where more meet, four of them
 PARALLEL_FRACTION = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
+LEVELS_RISE = 2.0  # of one label's level over another's, per voxel across their surface
 FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
 
 
@@ -122,15 +123,17 @@ def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float)
 @unit
 def constraint_values(normal: Floats2, state: State, node: int) -> int:
     """The values of a node's constraints, to normal[6, :3]; how many there are."""
-    ticks, scale, count = state.complex.ticks, 2.0**-state.objective.bits, 0
+    ticks, meeting, objective, count = state.complex.ticks, state.complex.meeting, state.objective, 0
+    scale = 2.0**-objective.bits
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
     if state.complex.is_frozen[node, 3]:
         normal[6, 0] = level_at(state.sides.level, i, j, k)
         count = 1
     for m in range(1, MOST_MEETING):
-        if state.complex.meeting[node, m] >= 0 and count < 3:
+        if meeting[node, m] >= 0 and count < 3:
             one, other = _label_levels(state, node, m)
-            normal[6, count] = level_at(one, i, j, k) - level_at(other, i, j, k)
+            shift = objective.shift[meeting[node, m]] - objective.shift[meeting[node, 0]]
+            normal[6, count] = level_at(one, i, j, k) - level_at(other, i, j, k) + shift
             count += 1
     return count
 
@@ -204,12 +207,19 @@ def combined_ways(
 
 
 @helper
+def band_of(state: State, node: int) -> float:
+    """By how much the levels of two labels may differ at a node; 0 where a third, or a mask's surface, meets them."""
+    is_one = state.complex.meeting[node, 2] < 0 and not state.complex.is_frozen[node, 3]
+    return LEVELS_RISE * state.complex.band[node] if is_one else 0.0
+
+
+@helper
 def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
     """Whether all of a node's constraints are met."""
     count = constraint_values(normal, state, node)
-    far = 0.0
+    far, band = 0.0, band_of(state, node)
     for q in range(count):
-        far = max(far, abs(normal[6, q]))
+        far = max(far, abs(normal[6, q]) - band)
     return far < (ON_SURFACE_VOXELS if count == 1 else NEAR_CURVE_VOXELS)
 
 
@@ -235,7 +245,9 @@ def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
             return True
         if step == CURVE_STEPS or (step == NEWTON_STEPS and state.complex.meeting[node, 2] < 0):
             return False
-        value = row(normal, 6)
+        value, band = row(normal, 6), band_of(state, node)
+        if band > 0.0:  # to the nearer end of the band
+            value = (value[0] - np.copysign(band, value[0]), 0.0, 0.0)
         count = normals_at(normal, state, node)
         is_found, way = combined_ways(normal, count, value)
         if not is_found:

@@ -71,6 +71,11 @@ def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
     return np.stack([np.sqrt(_dot(normal, normal)) for normal in _facet_normals(points, cells)], axis=1)
 
 
+def regular_edge(size: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Edge, mm, of the regular simplex in n dimensions that has a volume, mm^n."""
+    return (6.0 * 2.0**0.5 * size) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * size) ** 0.5
+
+
 Vectors = list[NDArray[np.float64]]  # (n,) of them, their components, (M,) each: three times as fast as rows
 
 
