@@ -7,6 +7,7 @@ from scipy.sparse import csr_array
 from test_labelling import across_of, lattice
 
 import tetopt
+from tetopt.contents.content import BAND_FRACTION
 from tetopt.contents.memberships import labels_at, memberships
 from tetopt.engine.interfaces import PART_CENTRES, cell_contents
 from tetopt.engine.labelling import balanced, contacts_of, labelled
@@ -115,3 +116,53 @@ def test_a_shell_of_one_cell_is_whole(thickness, percent):
     assert [row.mesh_euler for row in rows] == [2, 4, 4]  # two spheres around the shell: no hole
     assert contact(result.mesh, result.labels, 1, 3) < 1e-3 * rows[1].area
     assert dict(result.violated) == {}
+
+
+def meshed_label(inside, nodes, band=None, order=1, keep_volumes=True):
+    """The content of one label beside another, its mesh, and how well the label is met."""
+    image = tetopt.Image(inside.astype(float))
+    content = tetopt.content(image, image, weights=[0.0], keep_volumes=keep_volumes)
+    if band is not None:
+        content = content._replace(smooth=content.smooth._replace(band=band))
+    result = tetopt.mesh_image(content, nodes, order=order)
+    return content, result, tetopt.label_fidelity(image, result.mesh, result.labels)[1]
+
+
+def off_surface(content, result):
+    """How far nodes between the two labels are off their surface, voxels."""
+    n_labels = [
+        np.unique(result.labels[(result.mesh.cells == k).any(axis=1)]).size for k in range(len(result.mesh.points))
+    ]
+    at = content.image.to_index(result.mesh.points[np.array(n_labels) == 2]).T
+    one, other = (map_coordinates(level, at, order=1, mode="nearest") for level in content.memberships.levels)
+    return 0.5 * np.abs(one - other)
+
+
+BALL = np.linalg.norm(np.indices((40, 28, 28)) - np.array([20, 13.4, 13.4])[:, None, None, None], axis=0) < 9.0
+
+
+def test_facets_on_a_ball_do_not_cut_it_off():
+    """Nodes may be off the surface by a part of the edge, so that facets lie on both sides of it."""
+    content, result, fidelity = meshed_label(BALL, 250)
+    bound, without, inscribed = meshed_label(BALL, 250, band=0.0)
+    assert np.mean(off_surface(bound, without) < 0.01) > 0.9  # all but a few that cannot get there
+    edge = tetopt.quality(result.mesh.points, result.mesh.cells).max_edge
+    off = off_surface(content, result)
+    assert np.median(off) > 0.05
+    assert np.mean(off < BAND_FRACTION * edge) > 0.9
+    assert inscribed.mesh_volume / inscribed.volume < 0.955
+    assert fidelity.mesh_volume / fidelity.volume > 0.965
+    assert 1.0 - fidelity.dice < 0.4 * (1.0 - inscribed.dice)
+
+
+def test_corners_of_curved_cells_are_on_the_surface():
+    content, result, _ = meshed_label(BALL, 1200, order=2)
+    assert np.mean(off_surface(content, result) < 0.01) > 0.9
+
+
+def test_the_surface_of_a_thin_rod_goes_outwards():
+    """Cells of its own cannot make up for what facets cut off; with free volumes nothing does."""
+    rod = np.linalg.norm(np.indices((40, 28, 28))[1:] - 13.4, axis=0) < 2.5
+    kept, free = (meshed_label(rod, 220, keep_volumes=keep)[2] for keep in (True, False))
+    assert kept.mesh_volume > free.mesh_volume + 0.02 * free.volume
+    assert 0.86 * kept.volume < kept.mesh_volume < kept.volume
