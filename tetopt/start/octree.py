@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import oriented
 from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
@@ -51,7 +50,7 @@ TRIAL_MISS = 0.05  # so near, no other size of the undivided blocks is tried;
 LARGEST_MISS = 0.1  # further away it is an error,
 LARGEST_MISS_NODES = 40  # unless it is by so few nodes: about what one block more or less makes.
 BISECTION_STEPS = 60  # for the threshold, at most: it is then known to the last bit
-TARGET_TRIAL_MISS = 0.25  # so near, with targets, no other number is tried within a mask: exchanges reach any number
+TARGET_MISS = 0.25  # by so much targets may exceed the requested nodes before they are enlarged, within a mask
 LIGHTER_TRIALS = 5  # of factors on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 ALWAYS_ALLOWED_NODES = 5000  # even on images of fewer voxels
@@ -243,8 +242,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     image, region = content.image, content.region
     if region is None:
         return _octree_of_box(content, nodes, limits)
-    # The surface takes away nodes and adds others; how many is known only afterwards. Towards targets exchanges follow.
-    miss = TRIAL_MISS if limits.target is None else TARGET_TRIAL_MISS
+    # Nodes of the leaves that the region touches are, to a few per cent, as many as there are once they are cut off.
     limits = _lighter(content, nodes, limits)
     nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
@@ -256,8 +254,10 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
             in_box *= 2
             continue
         count = len(mesh.points)
-        nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
-        if abs(count - nodes) <= miss * nodes:
+        if nearest and abs(count - nodes) >= abs(len(nearest[0].points) - nodes):
+            break
+        nearest = [mesh]
+        if abs(count - nodes) <= LARGEST_MISS * nodes:
             break
         in_box = int(np.clip(in_box * nodes / count, max(fewest, in_box / 2), 2 * in_box))
     return nearest[0]
@@ -276,7 +276,7 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
         blocks = _blocks_by_depth(content, channels, roots, limits)
         regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
         count = len(leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions).codes)
-        if count <= (1.0 + TARGET_TRIAL_MISS) * nodes:
+        if count <= (1.0 + TARGET_MISS) * nodes:
             break
         limits = limits._replace(target=limits.target * np.float32((count / nodes) ** (1.0 / content.image.ndim)))
     return limits
@@ -287,9 +287,9 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     image = content.image
     _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
-    leaf = leaf_nodes(divided, roots)
-    points = image.to_world(leaf.index() / np.array(roots) * image.shape - 0.5)
-    return Mesh(points, oriented(points, leaf_cells(divided, roots, leaf)))
+    joined = leaf_nodes(divided, roots)
+    points = image.to_world(joined.index() / np.array(roots) * image.shape - 0.5)
+    return Mesh(points, leaf_cells(divided, roots, joined, points))
 
 
 class _Blocks(NamedTuple):
