@@ -56,7 +56,8 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
 
 def _sides(level: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which cells have a node inside, and which have one outside, (M,) each."""
-    return (level < 0.0)[cells].any(axis=1), (level > 0.0)[cells].any(axis=1)
+    of_cells = level[cells]
+    return np.asarray(of_cells.min(axis=1) < 0.0), np.asarray(of_cells.max(axis=1) > 0.0)
 
 
 def lattice_within(

@@ -1,13 +1,16 @@
 """Nodes and cells of an octree's leaves (in 2-D a quadtree's): corners and centres, joined by templates.
 
-Neighbouring leaves differ by one division at most, also across edges and corners. So the middle of a leaf's edge is a
-node or is none, as the centre of its face is, and both sides of a face cut it alike without knowing one another. All
-cells of a leaf meet in its centre. In 2-D the others of their nodes are the ends of an edge, or of each half of one
-that has a node in its middle. In 3-D they are, by what lies across a face,
+Neighbouring leaves differ by one division at most, also across edges and corners: each edge of a leaf has a node in its
+middle or none, each face one in its centre or none, and both sides of a face divide it alike. The cells of a leaf share
+its centre. In 2-D their other nodes are the ends of an edge, or of a half of one with a node in its middle. In 3-D they
+depend on what lies across a face:
 
-- a leaf as large: its centre, and the ends of a piece of the face's edges; the four cells of the body-centred lattice,
-- smaller leaves: the node in the face's centre, and the ends of a piece of the face's edges,
-- a larger leaf, or nothing on the box's sides: a triangle of the face.
+- A leaf of the same size: its centre, and two neighbouring nodes around the face. Without nodes in the middle of edges
+  these are the four cells of a body-centred lattice.
+- Smaller leaves: the node in the face's centre, and two neighbouring nodes around the face.
+- A larger leaf, or the outside of the box: a triangle of the face.
+
+Where blocks are cubes the cells are Delaunay, and no dihedral angle is below 30 degrees.
 """
 
 from __future__ import annotations
@@ -35,13 +38,13 @@ class LeafNodes(NamedTuple):
     steps: NDArray[np.int64]  # (n,) in a code, of one along each axis
     depth: int  # of the smallest leaves
 
-    def index(self) -> NDArray[np.float64]:
+    def places(self) -> NDArray[np.float64]:
         """Their places, (N, n), in units of an undivided block."""
-        place, rest = [], self.codes
+        along_axes, rest = [], self.codes
         for step in self.steps:
             along, rest = np.divmod(rest, step)
-            place.append(along)
-        return np.stack(place, axis=1) / 2.0 ** (self.depth + 1)
+            along_axes.append(along)
+        return np.stack(along_axes, axis=1) / 2.0 ** (self.depth + 1)
 
     def at(self, codes: NDArray[np.int64]) -> NDArray[np.int64]:
         """The nodes of these codes, -1 where there is none."""
@@ -89,7 +92,7 @@ def leaf_cells(
     for d, leaves in enumerate(leaves_by_depth(divided, roots)):
         for start in range(0, len(leaves), LEAVES_AT_A_TIME):
             some = leaves[start : start + LEAVES_AT_A_TIME]
-            pieces = _cells_in_plane(some, nodes, d) if len(roots) == 2 else _cells(some, roots, nodes, d)
+            pieces = (_cells_in_plane if len(roots) == 2 else _cells)(some, nodes, d)
             cells += [oriented(points, piece) for piece in pieces]
     joined = np.concatenate(cells)
     del cells
@@ -103,36 +106,46 @@ def _cells_in_plane(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> 
     yield _around(ring, nodes.at(first + nodes.steps.sum() << shift)[:, None])
 
 
-def _cells(
-    leaves: NDArray[np.int64], roots: tuple[int, ...], nodes: LeafNodes, depth: int
-) -> Iterator[NDArray[np.int64]]:
+def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
     """The tetrahedra of leaves of one depth, face by face; those between two leaves by the first of these."""
     first, shift = 2 * leaves @ nodes.steps, nodes.depth - depth
     centre = nodes.at(first + nodes.steps.sum() << shift)
     for axis in range(3):
         step, along = nodes.steps[axis], np.delete(nodes.steps, axis)
-        for side, last in ((-1, 0), (1, (roots[axis] << depth) - 1)):
+        for side in (-1, 1):
             face = first + (1 + side) * step
             ring = np.stack([nodes.at(face + more << shift) for more in RING @ along], axis=1)
             middle = nodes.at(face + along.sum() << shift)
+            # Beyond the box that is the code of a place with odd and even coordinates, where no node is.
             across = nodes.at(first + nodes.steps.sum() + 2 * side * step << shift)
-            across[leaves[:, axis] == last] = -1
             is_fine, is_even = middle >= 0, (middle < 0) & (across >= 0)
             yield _around(ring[is_fine], np.stack([centre, middle], axis=1)[is_fine])
             if side > 0:
-                yield _around(ring[is_even], np.stack([centre, across], axis=1)[is_even])
+                yield from _between(ring[is_even], np.stack([centre, across], axis=1)[is_even])
             is_odd = np.delete(leaves, axis, axis=1).sum(axis=1) % 2 == 1
             yield from _on_squares(ring, centre, is_odd, ~is_fine & ~is_even)
 
 
-def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells of the tips, (K, t), and each piece of the edges around squares, (K, 8), -1 where one is whole."""
-    cells = []
+def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Cells between the centres of two leaves, (K, 2), that share a face.
+
+    Where its corner lies between two nodes in the middle of edges, the three are cut off, as Delaunay has it.
+    """
+    left = ring.copy()
     for k in (0, 2, 4, 6):
-        a, middle, b = ring[:, k], ring[:, k + 1], ring[:, (k + 2) % 8]
-        is_whole = middle < 0
-        cells += [np.column_stack([tips, a, np.where(is_whole, b, middle)])]
-        cells += [np.column_stack([tips, middle, b])[~is_whole]]
+        triangle = ring[:, [k - 1, k, k + 1]]
+        is_cut = triangle.min(axis=1) >= 0
+        left[is_cut, k] = -1
+        yield from (np.column_stack([end, triangle])[is_cut] for end in ends.T)
+    yield _around(left, ends)
+
+
+def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cells of the tips, (K, t), and each two neighbours of a ring, (K, 8), -1 where it has no node."""
+    cells = []
+    for k in range(8):
+        first, second, third = ring[:, k], ring[:, (k + 1) % 8], ring[:, (k + 2) % 8]
+        cells.append(np.column_stack([tips, first, np.where(second < 0, third, second)])[first >= 0])
     return np.concatenate(cells)
 
 

@@ -5,10 +5,11 @@ those that hold the largest sum of squared deviations from their mean: that is t
 block, so what is left is spread evenly over the leaves. Noise has no say: of each block's sum, what noise of the
 image's own strength would leave is taken off, so that a noisy but uniform region stays coarse. Neighbouring leaves
 differ by one division at most, also across edges and corners (2:1), and nodes are put at their corners and centres: a
-lattice of body-centred cubes that coarsens by steps of two, joined by templates (`leaves`). Sizes (`tetopt.Sizes`) have the first
-say: blocks with longer edges than are allowed are divided, whatever they hold, and those whose halves would be too
-short are not. Blocks halve, so that a target for the usual edge lies between two of them: here and there one is
-divided, as many as give the target's number of nodes, and the exchanges of `optimize` make the rest of it.
+lattice of body-centred cubes that coarsens by steps of two, whose cells are templates (`tetopt.start.leaves`). Sizes
+(`tetopt.Sizes`) have the first say: blocks with longer edges than are allowed are divided, whatever they hold, and
+those whose halves would be too short are not. Blocks halve, so that a target for the usual edge lies between two of
+them: here and there one is divided, as many as give the target's number of nodes, and the exchanges of `optimize` make
+the rest of it.
 
 The depth of a block is the number of divisions that it takes to get to it: 0 of the box's own blocks, the roots.
 """
@@ -60,7 +61,7 @@ SPREAD_OF_NOISE = 0.03  # of the noise's variance, likewise: chance does not dec
 NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not taken for content
 # Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
 TARGET_SLACK = 0.25
-OCTREE_NODE_BYTES = 3000.0  # of Delaunay's hull in one dimension more, six or seven cells to a node
+OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, put together and sorted: 600; as many to cut off a mask
 BLOCK_FIELD_BYTES = 8.0  # of the smallest blocks, for each field
 OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half of a field while it is halved
 # For the content's sake no more blocks are summed up, whose halves are the smallest leaves: 0.5 GB. Of 1024^3 voxels
@@ -266,7 +267,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits:
     """The limits with larger targets, where these alone divide the region's blocks into far more nodes than asked for.
 
-    A block goes by its least target. Found by counts: a mesh of a million nodes too many takes minutes.
+    A block goes by its least target. Found by counts, as a mesh takes longer.
     """
     if limits.target is None:
         return limits
@@ -288,7 +289,7 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
     joined = leaf_nodes(divided, roots)
-    points = image.to_world(joined.index() / np.array(roots) * image.shape - 0.5)
+    points = image.to_world(joined.places() / np.array(roots) * image.shape - 0.5)
     return Mesh(points, leaf_cells(divided, roots, joined, points))
 
 
