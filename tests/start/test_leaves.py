@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.start import leaves
-from tetopt.start.leaves import RING, leaf_cells, leaf_nodes
+from tetopt.start.leaves import FACE_RING, leaf_cells, leaf_nodes
 from tetopt.start.octree import _Blocks, _divided, octree_mesh
 
 seeds = st.integers(0, 2**32 - 1)
@@ -90,7 +90,7 @@ def test_undivided_blocks_are_a_lattice(kind, blocks):
 @pytest.mark.parametrize("mask", range(16))
 def test_triangles_of_a_square(mask):
     """They fill it, use every node around it, and have no angle below atan(1/2)."""
-    triangles = RING[np.array(list(leaves._triangles(mask)))].astype(float)
+    triangles = FACE_RING[np.array(list(leaves._triangles(mask)))].astype(float)
     sides = np.roll(triangles, -1, axis=1) - triangles
     back = -np.roll(sides, 1, axis=1)
     cross = sides[..., 0] * back[..., 1] - sides[..., 1] * back[..., 0]

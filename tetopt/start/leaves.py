@@ -8,7 +8,8 @@ depend on what lies across a face:
 - A leaf of the same size: its centre, and two neighbouring nodes around the face. Without nodes in the middle of edges
   these are the four cells of a body-centred lattice.
 - Smaller leaves: the node in the face's centre, and two neighbouring nodes around the face.
-- A larger leaf, or the outside of the box: a triangle of the face.
+- A larger leaf, the outside of the box, or a leaf of the same size across a face with nodes in the middle of opposite
+  edges: a triangle of the face.
 
 Where blocks are cubes the cells are Delaunay, and no dihedral angle is below 30 degrees.
 """
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from tetopt.geometry.simplex import oriented
 
 # Around a square, in halves of its edge: corners, and between them the middles of its edges.
-RING = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
+FACE_RING = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
 LEAVES_AT_A_TIME = 2**16  # whose cells are put together at a time
 
 
@@ -102,7 +103,7 @@ def leaf_cells(
 def _cells_in_plane(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
     shift = nodes.depth - depth
     first = 2 * leaves @ nodes.steps
-    ring = np.stack([nodes.at(first + step << shift) for step in RING @ nodes.steps], axis=1)
+    ring = np.stack([nodes.at(first + step << shift) for step in FACE_RING @ nodes.steps], axis=1)
     yield _around(ring, nodes.at(first + nodes.steps.sum() << shift)[:, None])
 
 
@@ -114,11 +115,14 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
         step, along = nodes.steps[axis], np.delete(nodes.steps, axis)
         for side in (-1, 1):
             face = first + (1 + side) * step
-            ring = np.stack([nodes.at(face + more << shift) for more in RING @ along], axis=1)
+            ring = np.stack([nodes.at(face + more << shift) for more in FACE_RING @ along], axis=1)
             middle = nodes.at(face + along.sum() << shift)
             # Beyond the box that is the code of a place with odd and even coordinates, where no node is.
             across = nodes.at(first + nodes.steps.sum() + 2 * side * step << shift)
-            is_fine, is_even = middle >= 0, (middle < 0) & (across >= 0)
+            # Two nodes in the middle of opposite edges and the two centres are a square, cut either way: by the face's
+            # diagonal there are more cells, and E_D is 1 % less.
+            is_square = (ring[:, [1, 5]].min(axis=1) >= 0) | (ring[:, [3, 7]].min(axis=1) >= 0)
+            is_fine, is_even = middle >= 0, (middle < 0) & (across >= 0) & ~is_square
             yield _around(ring[is_fine], np.stack([centre, middle], axis=1)[is_fine])
             if side > 0:
                 yield from _between(ring[is_even], np.stack([centre, across], axis=1)[is_even])
@@ -177,8 +181,8 @@ def _triangles(mask: int) -> Iterator[tuple[int, int, int]]:
     while len(left) > 2:
         ears = []
         for k, slot in enumerate(left):
-            before, after = RING[left[k - 1]], RING[left[(k + 1) % len(left)]]
-            (a, b), (c, d) = RING[slot] - before, after - before
+            before, after = FACE_RING[left[k - 1]], FACE_RING[left[(k + 1) % len(left)]]
+            (a, b), (c, d) = FACE_RING[slot] - before, after - before
             if a * d != b * c:
                 ears.append((int(c * c + d * d), slot % 2, int(a * (a - c) + b * (b - d)), k))
         k = min(ears)[-1]
