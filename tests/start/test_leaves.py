@@ -87,6 +87,17 @@ def test_undivided_blocks_are_a_lattice(kind, blocks):
     assert places(mesh) == places(lattice)
 
 
+def test_a_square_between_two_leaves_is_cut_along_their_face():
+    """No cell has both of their centres, where smaller leaves on two sides put nodes on opposite edges of the face."""
+    divided = np.zeros((3, 1, 2), dtype=bool)
+    divided[[0, 2], 0, 0] = True
+    mesh = joined((3, 1, 2), [divided])
+    corners = mesh.points[mesh.cells]
+    for node in ([1.5, 0.5, 0.5], [1.5, 0.5, 1.5]):
+        corners = corners[(corners == node).all(axis=2).any(axis=1)]
+    assert len(corners) == 0
+
+
 @pytest.mark.parametrize("mask", range(16))
 def test_triangles_of_a_square(mask):
     """They fill it, use every node around it, and have no angle below atan(1/2)."""
