@@ -156,7 +156,7 @@ def test_a_mesh_of_tissues_goes_with_mask_weights_contrasts_and_order():
     twin = tetopt.content([image, image], tetopt.tissue_labels(tissues), mask, weights=[1, 0], label_weight=2.0)
     volumes = []
     for each in (what, twin):
-        result = tetopt.mesh_image(each, 3000, iterations=6, order=2)
+        result = tetopt.mesh_image(each, 6000, iterations=6, order=2)
         assert not dict(result.violated)
         assert set(result.labels) == {0, 1, 2}
         size = np.abs(np.linalg.det(np.diff(result.mesh.points[result.mesh.cells[:, :4]], axis=1))) / 6.0

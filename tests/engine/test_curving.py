@@ -124,7 +124,7 @@ def test_a_mask_and_its_box():
     rows = boundary_rows(mesh)
     is_flat = (np.abs(mesh.points[facet_triples(mesh.cells, rows)][..., 0]) < 1e-6).all(axis=1)
     assert 20 < is_flat.sum() < 0.5 * len(rows)
-    assert off_the_sphere(mesh, rows[~is_flat]) < 0.4 * off_the_sphere(straight(mesh), rows[~is_flat])
+    assert off_the_sphere(mesh, rows[~is_flat]) < 0.45 * off_the_sphere(straight(mesh), rows[~is_flat])
     edges = numbered_edges(mesh.cells)[0]
     on_side = (np.abs(mesh.points[edges][..., 0]) < 1e-6).all(axis=1)
     np.testing.assert_allclose(mesh.midpoints[on_side, 0], 0.0, atol=1e-9)

