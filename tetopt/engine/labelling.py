@@ -285,10 +285,19 @@ def _dual(
 
 def _majority(dual: Dual) -> NDArray[np.int64]:
     """The label that most voxels of each cell have, of equally many the first."""
-    cell = np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
-    worth = dual.volume + dual.bias[dual.row] * dual.size[cell]
-    order = np.lexsort((dual.row, -worth, cell))
-    return dual.row[order[dual.first[:-1]]]
+    labels = np.empty(len(dual.cells), dtype=np.int64)
+    _fill_majority(labels, dual)
+    return labels
+
+
+@entry
+def _fill_majority(labels: Ints1, dual: Dual) -> None:
+    for cell in range(len(labels)):
+        most = -np.inf
+        for p in range(dual.first[cell], dual.first[cell + 1]):
+            worth = dual.volume[p] + dual.bias[dual.row[p]] * dual.size[cell]
+            if worth > most or (worth == most and dual.row[p] < labels[cell]):
+                labels[cell], most = dual.row[p], worth
 
 
 def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool) -> int:
@@ -298,11 +307,14 @@ def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], i
     """
     room = np.bincount(labels, dual.size, len(least)) - least
     n_of = np.bincount(labels, minlength=len(least))
-    total, gains = 0, np.zeros(len(labels))
+    total, gains, is_stale = 0, np.zeros(len(labels)), np.ones(len(labels), dtype=bool)
     while True:
-        _fill_gains(gains, dual, labels)
+        # Only cells that moved, and those beside them: of a head's 720,000 cells a fifth of the time of all of them.
+        _fill_gains(gains, dual, labels, np.flatnonzero(is_stale))
+        is_stale[:] = False
         active = np.flatnonzero(gains > LEAST_GAIN * dual.size)
-        moved = _settle_once(dual, labels, active[np.argsort(-gains[active], kind="stable")], room, n_of, is_careful)
+        order = active[np.argsort(-gains[active], kind="stable")]
+        moved = _settle_once(dual, labels, order, room, n_of, is_stale, is_careful)
         total += moved
         if moved == 0:
             return total
@@ -346,14 +358,19 @@ def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
 
 
 @entry
-def _fill_gains(gains: Floats1, dual: Dual, labels: Ints1) -> None:
-    for cell in range(len(labels)):
+def _fill_gains(gains: Floats1, dual: Dual, labels: Ints1, stale: Ints1) -> None:
+    for cell in stale:
         gains[cell] = _best_label(dual, labels, cell)[1]
 
 
 @entry
-def _settle_once(dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: Ints1, is_careful: bool) -> int:
-    """The cells of `order` take the best label of a neighbour one after the other, where that gains still."""
+def _settle_once(
+    dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: Ints1, is_stale: Bools1, is_careful: bool
+) -> int:
+    """The cells of `order` take the best label of a neighbour one after the other, where that gains still.
+
+    Those that do, and the cells beside them, are marked in `is_stale`.
+    """
     moved = 0
     for cell in order:
         old = labels[cell]
@@ -372,6 +389,10 @@ def _settle_once(dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: I
         n_of[old] -= 1
         n_of[new] += 1
         moved += 1
+        is_stale[cell] = True
+        for k in range(dual.across.shape[1]):
+            if dual.across[cell, k] >= 0:
+                is_stale[dual.across[cell, k]] = True
     return moved
 
 
@@ -470,14 +491,19 @@ def _without_fragments(
     ]
     is_loose, moved = ~np.array(stays)[number], 0
     way, before, bridge = np.full(len(labels), np.inf), np.empty_like(labels), np.empty_like(labels)
+    sorted_cells, n_of = np.argsort(number, kind="stable"), np.bincount(labels, minlength=len(components))
+    start = np.searchsorted(number[sorted_cells], np.arange(len(of_component) + 1))
     for component in order[~np.array(stays)[order]]:
-        if (labels[number == component] != of_component[component]).any():  # another bridge goes over it
+        own = sorted_cells[start[component] : start[component + 1]]
+        if (labels[own] != of_component[component]).any():  # another bridge goes over it
             continue
-        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == component), most[component])
-        n_of, n_taken = (np.bincount(of, minlength=len(components)) for of in (labels, labels[bridge[:count]]))
+        count = _bridge(bridge, way, before, dual, labels, own, most[component])
+        n_taken = np.bincount(labels[bridge[:count]], minlength=len(components))
         if count > 0 and ((n_taken == 0) | (n_taken < n_of)).all():  # no label goes for it
             labels[bridge[:count]] = of_component[component]
-            is_loose[bridge[:count]] = is_loose[number == component] = False
+            n_of -= n_taken
+            n_of[of_component[component]] += count
+            is_loose[bridge[:count]] = is_loose[own] = False
             is_bridge[bridge[:count]] = True
             moved += count
     return moved + _give_away(dual, labels, is_loose)
