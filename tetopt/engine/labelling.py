@@ -51,6 +51,9 @@ BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more 
 BALANCE_STEP = 3.0  # times the fraction of its volume that a label lacks: its bias rises so much,
 LONGEST_BALANCE_STEP = 0.1  # at most,
 FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known
+# of a label's volume may go, and come, where labels are given anew with the bias that made up for losses since: in cells
+# that are far larger than a label is thick such a bias gives or takes several times its volume
+MOST_SWING = (0.15, 0.4)
 MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
 
@@ -130,7 +133,11 @@ def labelled(
     aim = np.bincount(dual.row, dual.volume, n_labels).astype(np.float64)
     least = LEAST_FRACTION * aim
     begin = _majority(dual)
-    dual.bias[:] = _balance(dual, aim, least) if bias is None else bias
+    if bias is None:
+        _balance(dual, aim, least)
+    elif bias.any():
+        dual.bias[:] = bias
+        _balance(dual, aim, least, *MOST_SWING)
     labels = _majority(dual)
     if dual.bias.any():
         _keep_each(dual, labels)
@@ -182,17 +189,25 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
             labels[best] = label
 
 
-def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far."""
+def _balance(
+    dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64], below: float = 0.0, above: float = 0.0
+) -> None:
+    """Set the bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far.
+
+    Volumes from a fraction `below` under `aim` to a fraction `above` over it are left as they are.
+    """
     longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
         _settle(dual, labels, least, False)
-        step = balanced(dual.bias, aim, np.bincount(labels, dual.size, len(aim)), longest) - dual.bias
+        volume = np.bincount(labels, dual.size, len(aim))
+        near = np.clip(volume, (1.0 - below) * aim, (1.0 + above) * aim)
+        if np.array_equal(near, volume):
+            break
+        step = balanced(dual.bias, near, volume, longest) - dual.bias
         longest = np.where(step * before < 0.0, 0.5 * longest, longest)
         before = np.clip(step, -longest, longest)
         dual.bias[:] += before
-    return dual.bias
 
 
 def balanced(
