@@ -51,8 +51,8 @@ BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more 
 BALANCE_STEP = 3.0  # times the fraction of its volume that a label lacks: its bias rises so much,
 LONGEST_BALANCE_STEP = 0.1  # at most,
 FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known
-# of a label's volume may go, and come, where labels are given anew with the bias that made up for losses since: in cells
-# that are far larger than a label is thick such a bias gives or takes several times its volume
+# of a label's volume may go, and come, where labels are given anew with the bias that made up for losses since: in
+# cells that are far larger than a label is thick such a bias gives or takes several times its volume
 MOST_SWING = (0.15, 0.4)
 MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
