@@ -84,7 +84,7 @@ def with_balance(state: State, content: Content, mesh: Mesh) -> State:
     """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are kept.
 
     What cells of the label cannot make up for, since nodes on its surface cut off what is round, its surface does,
-    which goes outwards by a shift of the label's level.
+    which goes outwards by a shift of the label's level; inwards where the label has far too much.
     """
     if content.smooth is None or not content.smooth.keeps_volumes:
         return state

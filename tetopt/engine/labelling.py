@@ -50,10 +50,11 @@ LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs that touch l
 BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more hardly change it
 BALANCE_STEP = 3.0  # times the fraction of its volume that a label lacks: its bias rises so much,
 LONGEST_BALANCE_STEP = 0.1  # at most,
-FIRST_BALANCE_STEP = 0.2  # and so much where no bias is known
+FIRST_BALANCE_STEP = 0.2  # and so much where labels are given at once
 # of a label's volume may go, and come, where labels are given anew with the bias that made up for losses since: in
 # cells that are far larger than a label is thick such a bias gives or takes several times its volume
 MOST_SWING = (0.15, 0.4)
+SWING_ROUNDS = 4  # at most, in which they are given again
 MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
 
@@ -120,7 +121,8 @@ def labelled(
         Which labels the voxels keep apart; none by default.
     bias : (K,) float64, optional
         What each label is worth besides, as a fraction of a cell's volume; by default what keeps the labels' volumes,
-        as far as it can: a label that is thinner than cells has most of the voxels in few of them.
+        as far as it can: a label that is thinner than cells has most of the voxels in few of them. One that is given
+        is kept, unless labels take far more than their volumes by it, or far less (`MOST_SWING`).
     weight : float, optional
         Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
@@ -134,10 +136,27 @@ def labelled(
     least = LEAST_FRACTION * aim
     begin = _majority(dual)
     if bias is None:
-        _balance(dual, aim, least)
-    elif bias.any():
+        dual.bias[:] = _balance(dual, aim, least)
+    else:
         dual.bias[:] = bias
-        _balance(dual, aim, least, *MOST_SWING)
+    labels = _given(dual, least, voxel, components)
+    if bias is not None and bias.any():
+        labels = _without_swing(dual, labels, aim, least, voxel, components)
+    faces, is_two = _nonmanifold(dual, labels)
+    _, of_component = components_of(across, labels)
+    return Labelling(
+        labels,
+        int((labels != begin).sum()),
+        int((is_two & (faces[:, 1] >= 0)).sum()),
+        int((is_two & (faces[:, 1] < 0)).sum()),
+        np.bincount(of_component, minlength=n_labels),
+        np.flatnonzero((aim > 0.0) & (np.bincount(labels, minlength=n_labels) == 0)),
+        dual.bias,
+    )
+
+
+def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
+    """Labels of cells, (M,), by the dual's bias."""
     labels = _majority(dual)
     if dual.bias.any():
         _keep_each(dual, labels)
@@ -150,17 +169,30 @@ def labelled(
         if moved == 0:
             break
     _mend_pairs(dual, labels, LAST_FRACTION * least)
-    faces, is_two = _nonmanifold(dual, labels)
-    _, of_component = components_of(across, labels)
-    return Labelling(
-        labels,
-        int((labels != begin).sum()),
-        int((is_two & (faces[:, 1] >= 0)).sum()),
-        int((is_two & (faces[:, 1] < 0)).sum()),
-        np.bincount(of_component, minlength=n_labels),
-        np.flatnonzero((aim > 0.0) & (np.bincount(labels, minlength=n_labels) == 0)),
-        dual.bias,
-    )
+    return labels
+
+
+def _without_swing(
+    dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64], least: NDArray[np.float64], voxel: float,
+    components: list[NDArray],
+) -> NDArray[np.int64]:  # fmt: skip
+    """Labels, (M,), with as little volume as possible beyond `MOST_SWING` of `aim`; the dual's bias is theirs.
+
+    The bias that made up for what labels have lost since they were given may be far too strong for labels given anew.
+    """
+    bias, best, fewest = dual.bias.copy(), labels, np.inf
+    for k in range(SWING_ROUNDS + 1):
+        volume = np.bincount(labels, dual.size, len(aim))
+        near = np.clip(volume, (1.0 - MOST_SWING[0]) * aim, (1.0 + MOST_SWING[1]) * aim)
+        beyond = float(np.abs(volume - near).sum())
+        if beyond < fewest:
+            bias[:], best, fewest = dual.bias, labels, beyond
+        if fewest == 0.0 or k == SWING_ROUNDS:
+            break
+        dual.bias[:] = balanced(dual.bias, near, volume, FIRST_BALANCE_STEP)
+        labels = _given(dual, least, voxel, components)
+    dual.bias[:] = bias
+    return best
 
 
 def unpinched(
@@ -189,25 +221,17 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
             labels[best] = label
 
 
-def _balance(
-    dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64], below: float = 0.0, above: float = 0.0
-) -> None:
-    """Set the bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far.
-
-    Volumes from a fraction `below` under `aim` to a fraction `above` over it are left as they are.
-    """
+def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far."""
     longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
         _settle(dual, labels, least, False)
-        volume = np.bincount(labels, dual.size, len(aim))
-        near = np.clip(volume, (1.0 - below) * aim, (1.0 + above) * aim)
-        if np.array_equal(near, volume):
-            break
-        step = balanced(dual.bias, near, volume, longest) - dual.bias
+        step = balanced(dual.bias, aim, np.bincount(labels, dual.size, len(aim)), longest) - dual.bias
         longest = np.where(step * before < 0.0, 0.5 * longest, longest)
         before = np.clip(step, -longest, longest)
         dual.bias[:] += before
+    return dual.bias
 
 
 def balanced(
