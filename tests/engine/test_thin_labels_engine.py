@@ -65,14 +65,19 @@ def test_small_cells_are_filled_by_levels_not_by_centres():
     assert ((above > 0.0) & (above < 1.0)).any()
 
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_a_thin_label_keeps_its_volume(n):
-    """A label that fills a third of the cells of a slab gets a third of these, or none without a bias."""
-    points, cells = lattice(n, 4)
-    size, across = volumes(points, cells), across_of(cells, len(points))
+def slab(n, cubes):
+    """A lattice with a slab in it: points, cells, those across, sizes, and how much of each cell a thin label fills."""
+    points, cells = lattice(n, cubes)
     middle = points[cells].mean(axis=1)
     is_slab = np.abs(middle[:, 0] - middle[:, 0].mean()) < 1.0
     share = np.where(is_slab, 0.32 + 0.12 * np.sin(7.0 * middle[:, -1]), 0.0)
+    return points, cells, across_of(cells, len(points)), volumes(points, cells), share
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_thin_label_keeps_its_volume(n):
+    """A label that fills a third of the cells of a slab gets a third of these, or none without a bias."""
+    points, cells, across, size, share = slab(n, 4)
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
     kept = labelled(points, cells, across, counts, NO_COMPONENTS[:2], weight=1e-3)
     lost = labelled(points, cells, across, counts, NO_COMPONENTS[:2], bias=np.zeros(2), weight=1e-3)
@@ -85,20 +90,15 @@ def test_a_thin_label_keeps_its_volume(n):
 @pytest.mark.parametrize("bias", [[0.0, 0.9], [0.2, 0.0]])
 def test_a_bias_that_is_far_too_strong_is_found_again(bias):
     """The slab as above: by such a bias it would take all of its cells, or none."""
-    points, cells = lattice(3, 6)
-    size, across = volumes(points, cells), across_of(cells, len(points))
-    middle = points[cells].mean(axis=1)
-    is_slab = np.abs(middle[:, 0] - middle[:, 0].mean()) < 1.0
-    share = np.where(is_slab, 0.32 + 0.12 * np.sin(7.0 * middle[:, -1]), 0.0)
+    points, cells, across, size, share = slab(3, 6)
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
-    bias = np.array(bias)
-    voxels = [counts.toarray()[:, row].sum() for row in range(2)]
-    made = labelled(points, cells, across, counts, NO_COMPONENTS[:2], bias=bias, weight=1e-3)
+    made = labelled(points, cells, across, counts, NO_COMPONENTS[:2], bias=np.array(bias), weight=1e-3)
+    aim = (share * size).sum()
     lowest, highest = 1.0 - MOST_SWING[0], 1.0 + MOST_SWING[1]
     reached = lowest - 0.1  # in a few rounds
-    by_bias = np.argmax(counts.toarray() + bias * size[:, None], axis=1)
-    assert not lowest < size[by_bias == 1].sum() / voxels[1] < highest
-    assert reached < size[made.labels == 1].sum() / voxels[1] < highest
+    by_bias = np.argmax(counts.toarray() + np.outer(size, bias), axis=1)
+    assert not lowest < size[by_bias == 1].sum() / aim < highest
+    assert reached < size[made.labels == 1].sum() / aim < highest
 
 
 def test_a_bias_rises_for_what_is_missing():

@@ -135,13 +135,11 @@ def labelled(
     aim = np.bincount(dual.row, dual.volume, n_labels).astype(np.float64)
     least = LEAST_FRACTION * aim
     begin = _majority(dual)
-    if bias is None:
-        dual.bias[:] = _balance(dual, aim, least)
-    else:
-        dual.bias[:] = bias
-    labels = _given(dual, least, voxel, components)
+    dual.bias[:] = _balance(dual, aim, least) if bias is None else bias
     if bias is not None and bias.any():
-        labels = _without_swing(dual, labels, aim, least, voxel, components)
+        labels = _without_swing(dual, aim, least, voxel, components)
+    else:
+        labels = _given(dual, least, voxel, components)
     faces, is_two = _nonmanifold(dual, labels)
     _, of_component = components_of(across, labels)
     return Labelling(
@@ -173,24 +171,23 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
 
 
 def _without_swing(
-    dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64], least: NDArray[np.float64], voxel: float,
-    components: list[NDArray],
-) -> NDArray[np.int64]:  # fmt: skip
+    dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64], voxel: float, components: list[NDArray]
+) -> NDArray[np.int64]:
     """Labels, (M,), with as little volume as possible beyond `MOST_SWING` of `aim`; the dual's bias is theirs.
 
     The bias that made up for what labels have lost since they were given may be far too strong for labels given anew.
     """
-    bias, best, fewest = dual.bias.copy(), labels, np.inf
-    for k in range(SWING_ROUNDS + 1):
+    fewest = np.inf
+    for _ in range(1 + SWING_ROUNDS):
+        labels = _given(dual, least, voxel, components)
         volume = np.bincount(labels, dual.size, len(aim))
         near = np.clip(volume, (1.0 - MOST_SWING[0]) * aim, (1.0 + MOST_SWING[1]) * aim)
         beyond = float(np.abs(volume - near).sum())
         if beyond < fewest:
-            bias[:], best, fewest = dual.bias, labels, beyond
-        if fewest == 0.0 or k == SWING_ROUNDS:
+            best, bias, fewest = labels, dual.bias.copy(), beyond
+        if beyond == 0.0:
             break
         dual.bias[:] = balanced(dual.bias, near, volume, FIRST_BALANCE_STEP)
-        labels = _given(dual, least, voxel, components)
     dual.bias[:] = bias
     return best
 

@@ -254,9 +254,9 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     >>> image = phantom.image(voxel_mm=4)
     >>> result = tetopt.mesh_image(tetopt.content(image, labels), 300)
     >>> for each in tetopt.label_fidelity(labels, result.mesh, result.labels):
-    ...     print(f"label {each.label}: Dice {each.dice:.2f}, off by {each.distance_mean:.0f} mm")
-    label 0: Dice 1.00, off by 1 mm
-    label 1: Dice 1.00, off by 1 mm
+    ...     print(f"label {each.label}: Dice {each.dice:.2f}, off by {each.distance_mean:.1f} mm")
+    label 0: Dice 1.00, off by 0.6 mm
+    label 1: Dice 1.00, off by 0.6 mm
     """
     check_labels("labels", labels)
     owner = cell_of_voxel(labels, mesh)
