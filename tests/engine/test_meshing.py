@@ -63,12 +63,12 @@ def test_nodes_of_order_2_are_counted_in_all(n):
     """Corners and midpoints together; the same run as with these corners and this longest edge from the start."""
     image = IMAGE if n == 3 else tetopt.Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
     nodes = 900 if n == 3 else 300
-    result = tetopt.mesh_image(image, nodes, order=2, iterations=4)
+    result = tetopt.mesh_image(image, nodes, order=2, iterations=16)
     points, cells = result.mesh.points, result.mesh.cells
     assert abs(len(quadratic(points, cells)[0]) - nodes) <= 0.01 * nodes
     assert result.nodes == nodes
     sizes = sizes_of_order(plain(image), nodes, None, 2)
-    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=4), result)
+    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=16), result)
 
 
 def test_a_lattice_for_order_2():

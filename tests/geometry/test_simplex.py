@@ -1,5 +1,6 @@
 """Volumes, radius ratios, circumcentres, angles and areas: closed forms first, then laws."""
 
+import sys
 from itertools import permutations
 from math import acos, degrees, sqrt
 
@@ -71,6 +72,13 @@ def test_volumes_are_those_of_exact_arithmetic(seed, n):
     points, cells = random_cells(seed, n)
     exact = [float(naive.signed_volume([naive.exactly(points)[a] for a in cell])) for cell in cells]
     np.testing.assert_allclose(volumes(points, cells), exact, rtol=1e-12, atol=1e-15)
+
+
+def test_volumes_do_not_depend_on_how_many_are_taken_at_a_time(monkeypatch):
+    points, cells = random_cells(3, 3)
+    whole = volumes(points, cells)
+    monkeypatch.setattr(sys.modules["tetopt.geometry.simplex"], "CELLS_AT_A_TIME", 2)
+    np.testing.assert_array_equal(volumes(points, cells), whole)
 
 
 def test_volume_is_exactly_zero_with_a_node_twice():

@@ -8,10 +8,10 @@ from meshes import box_corners, random_affine
 from naive import circumcentres
 from scipy.spatial import Delaunay
 
-from tetopt import Image, Mesh, check_mesh, lattice_mesh
-from tetopt.geometry.simplex import oriented, squared_edges, volumes
+from tetopt import Image, lattice_mesh
+from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import facets
-from tetopt.start.delaunay import delaunay, without_flat
+from tetopt.start.delaunay import delaunay
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
@@ -148,25 +148,3 @@ def test_no_cells_for_nodes_in_a_plane_or_given_twice():
     assert delaunay(flat, np.eye(4)) is None
     twice = np.vstack([grid_nodes(3, 3, 3), [[1.0, 1.0, 1.0]]])
     assert delaunay(twice, np.eye(4)) is None
-
-
-@pytest.mark.parametrize("is_on_side", [False, True])
-def test_flat_cells_are_taken_away(is_on_side):
-    """A square cut one way above and the other way below, with a flat cell between; and one on the box's side."""
-    square = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    points = np.vstack([square, [[0.0, 0, 1], [0, 0, -1]]])
-    cells = [[0, 1, 2, 4], [0, 2, 3, 4], [0, 1, 2, 3]]
-    cells += [] if is_on_side else [[0, 1, 3, 5], [1, 2, 3, 5]]
-    cells = oriented(points, np.array(cells))
-    assert (volumes(points, cells) < 1e-9).sum() == 1
-    mended = without_flat(points, cells, 1e-6)
-    mesh = Mesh(points[: 5 if is_on_side else 6], mended)
-    assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(2.0 / 3.0 if is_on_side else 4.0 / 3.0)
-    assert len(mended) == (2 if is_on_side else 4)
-    assert check_mesh(mesh) == []
-
-
-def test_cells_that_are_not_flat_stay():
-    cells = np.array([[0, 1, 2, 3]])
-    points = np.vstack([np.zeros(3), np.eye(3)])
-    assert without_flat(points, cells, 1e-6) is cells

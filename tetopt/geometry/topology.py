@@ -40,6 +40,13 @@ def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
     return Stars(start, (order // cells.shape[1]).astype(np.int64))
 
 
+def compact(cells: NDArray[np.int64], n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The nodes, of `n_nodes`, that cells use, ascending, and the cells by the places of their nodes among these."""
+    is_used = np.zeros(n_nodes, dtype=bool)
+    is_used[cells] = True
+    return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[cells]
+
+
 def facets(cells: NDArray[np.integer]) -> Facets:
     """Distinct facets of positively oriented cells (M, n+1).
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tetopt.contents.domain import Region
 from tetopt.geometry.manifold import manifold_part
 from tetopt.geometry.simplex import centroids, volumes
-from tetopt.geometry.topology import components
+from tetopt.geometry.topology import compact, components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -61,8 +61,8 @@ def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
     """The cells of a mesh that stay, (M,), without the nodes that no cell uses then."""
     if is_kept.all():
         return mesh
-    used, compact = np.unique(mesh.cells[is_kept], return_inverse=True)
-    return Mesh(mesh.points[used], compact.reshape(-1, mesh.ndim + 1))
+    used, cells = compact(mesh.cells[is_kept], len(mesh.points))
+    return Mesh(mesh.points[used], cells)
 
 
 def n_components(region: Region) -> int:

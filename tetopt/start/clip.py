@@ -14,6 +14,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, is_on_sides
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.simplex import squared_edges, volumes
+from tetopt.geometry.topology import compact
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
@@ -37,16 +38,26 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     index = image.to_index(mesh.points)
     level = levels(region.level, index)
     level[np.abs(level) < ON_SURFACE_VOXELS] = 0.0
-    index, level = _snapped(index, level, mesh.cells, image, region)
-    index, level, cells = _cut(index, level, mesh.cells, region)
-    side = np.sign(level)[cells].sum(axis=1)
-    is_flat = (level[cells] == 0.0).all(axis=1)
-    side[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1))
-    kept = cells[side < 0.0]
-    if len(kept) == 0:
+    # The surface changes only the cells that share a node with one that it crosses: of a large mesh they are few.
+    is_inside, is_outside = _sides(level, mesh.cells)
+    is_touched = np.zeros(len(level), dtype=bool)
+    is_touched[mesh.cells[is_inside & is_outside]] = True
+    near = np.flatnonzero(is_touched[mesh.cells].any(axis=1))
+    index, level = _snapped(index, level, mesh.cells[near], image, region)
+    index, level, cells = _cut(index, level, mesh.cells, near, region)
+    is_inside, is_outside = _sides(level, cells)
+    is_flat = ~(is_inside | is_outside)
+    is_inside[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1)) < 0.0
+    if not is_inside.any():
         raise InputError("mask: it is thinner than the cells, none is left inside; ask for more nodes")
-    used, compact = np.unique(kept, return_inverse=True)
-    return Mesh(image.to_world(index[used]), compact.reshape(kept.shape))
+    used, kept = compact(cells[is_inside], len(index))
+    return Mesh(image.to_world(index[used]), kept)
+
+
+def _sides(level: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which cells have a node inside, and which have one outside, (M,) each."""
+    of_cells = level[cells]
+    return np.asarray(of_cells.min(axis=1) < 0.0), np.asarray(of_cells.max(axis=1) > 0.0)
 
 
 def lattice_within(
@@ -147,35 +158,36 @@ def _slope(level: NDArray, index: NDArray[np.float64], axis: int) -> NDArray[np.
 
 
 def _cut(
-    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], region: Region
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Nodes, their levels and cells after every edge that crosses the surface is split there.
+    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], near: NDArray[np.int64],
+    region: Region,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
+    """Nodes, their levels and cells after every edge that crosses the surface is split there; `near` numbers its cells.
 
     In each round every cell is split at the first of its crossing edges, in an order that is the same for all cells,
     so that two of them always cut the facet between them alike.
     """
-    edge = edge_ends(cells).reshape(-1, 2)
-    edge = np.unique(edge[level[edge].prod(axis=1) < 0.0], axis=0)
-    if len(edge) == 0:
-        return index, level, cells
     n_nodes = len(index)
-    index = np.vstack([index, _crossings(index[edge[:, 0]], index[edge[:, 1]], region)])
-    level = np.append(level, np.zeros(len(edge)))
-    code = edge[:, 0] * n_nodes + edge[:, 1]
-    while True:
-        of_cell = edge_ends(cells)
-        crosses = level[of_cell].prod(axis=2) < 0.0
+    ends = edge_ends(cells[near])
+    crosses = level[ends].prod(axis=2) < 0.0
+    code = np.unique(ends[crosses] @ [n_nodes, 1])
+    a, b = np.divmod(code, n_nodes)
+    index = np.vstack([index, _crossings(index[a], index[b], region)])
+    level = np.append(level, np.zeros(len(code)))
+    near = near[crosses.any(axis=1)]
+    done, open_cells = [np.delete(cells, near, axis=0)], cells[near]
+    while len(open_cells):
+        ends = edge_ends(open_cells)
+        crosses = level[ends].prod(axis=2) < 0.0
         is_cut = crosses.any(axis=1)
-        if not is_cut.any():
-            return index, level, cells
-        cut, of_cell = cells[is_cut], of_cell[is_cut]
-        codes = np.where(crosses[is_cut], of_cell[..., 0] * n_nodes + of_cell[..., 1], n_nodes * n_nodes)
-        first = codes.min(axis=1)
+        done.append(open_cells[~is_cut])
+        cut = open_cells[is_cut]
+        first = np.where(crosses[is_cut], ends[is_cut] @ [n_nodes, 1], n_nodes * n_nodes).min(axis=1)
         node = n_nodes + np.searchsorted(code, first)
         one, other = cut.copy(), cut.copy()
         one[cut == (first // n_nodes)[:, None]] = node
         other[cut == (first % n_nodes)[:, None]] = node
-        cells = np.concatenate([cells[~is_cut], one, other])
+        open_cells = np.concatenate([one, other])
+    return index, level, np.concatenate(done)
 
 
 def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Region) -> NDArray[np.float64]:

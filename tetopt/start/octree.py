@@ -5,17 +5,18 @@ those that hold the largest sum of squared deviations from their mean: that is t
 block, so what is left is spread evenly over the leaves. Noise has no say: of each block's sum, what noise of the
 image's own strength would leave is taken off, so that a noisy but uniform region stays coarse. Neighbouring leaves
 differ by one division at most, also across edges and corners (2:1), and nodes are put at their corners and centres: a
-lattice of body-centred cubes that coarsens by steps of two, joined by Delaunay. Sizes (`tetopt.Sizes`) have the first
-say: blocks with longer edges than are allowed are divided, whatever they hold, and those whose halves would be too
-short are not. Blocks halve, so that a target for the usual edge lies between two of them: here and there one is
-divided, as many as give the target's number of nodes, and the exchanges of `optimize` make the rest of it.
+lattice of body-centred cubes that coarsens by steps of two, whose cells are templates (`tetopt.start.leaves`). Sizes
+(`tetopt.Sizes`) have the first say: blocks with longer edges than are allowed are divided, whatever they hold, and
+those whose halves would be too short are not. Blocks halve, so that a target for the usual edge lies between two of
+them: here and there one is divided, as many as give the target's number of nodes, and the exchanges of `optimize` make
+the rest of it.
 
 The depth of a block is the number of divisions that it takes to get to it: 0 of the box's own blocks, the roots.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from math import prod
 from typing import NamedTuple
 
@@ -25,12 +26,11 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
-from tetopt.start.delaunay import delaunay, without_flat
 from tetopt.start.lattice import near_cubes
+from tetopt.start.leaves import leaf_cells, leaf_nodes
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
     NO_BOUND_MM,
@@ -51,7 +51,7 @@ TRIAL_MISS = 0.05  # so near, no other size of the undivided blocks is tried;
 LARGEST_MISS = 0.1  # further away it is an error,
 LARGEST_MISS_NODES = 40  # unless it is by so few nodes: about what one block more or less makes.
 BISECTION_STEPS = 60  # for the threshold, at most: it is then known to the last bit
-TARGET_TRIAL_MISS = 0.25  # so near, with targets, no other number is tried within a mask: exchanges reach any number
+TARGET_MISS = 0.25  # by so much targets may exceed the requested nodes before they are enlarged, within a mask
 LIGHTER_TRIALS = 5  # of factors on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 ALWAYS_ALLOWED_NODES = 5000  # even on images of fewer voxels
@@ -61,7 +61,7 @@ SPREAD_OF_NOISE = 0.03  # of the noise's variance, likewise: chance does not dec
 NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not taken for content
 # Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
 TARGET_SLACK = 0.25
-OCTREE_NODE_BYTES = 3000.0  # of Delaunay's hull in one dimension more, six or seven cells to a node
+OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, put together and sorted: 600; as many to cut off a mask
 BLOCK_FIELD_BYTES = 8.0  # of the smallest blocks, for each field
 OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half of a field while it is halved
 # For the content's sake no more blocks are summed up, whose halves are the smallest leaves: 0.5 GB. Of 1024^3 voxels
@@ -72,8 +72,6 @@ UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  #
 SKIPPED_RATIO = 2.0  # of the requested nodes: with more leaves, nodes are not counted one by one
 NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
 TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
-TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
-FLAT_VOLUME_FRACTION = 1e-6  # of the mean volume: a cell with less is flat
 
 
 def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
@@ -245,8 +243,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     image, region = content.image, content.region
     if region is None:
         return _octree_of_box(content, nodes, limits)
-    # The surface takes away nodes and adds others; how many is known only afterwards. Towards targets exchanges follow.
-    miss = TRIAL_MISS if limits.target is None else TARGET_TRIAL_MISS
+    # Nodes of the leaves that the region touches are, to a few per cent, as many as there are once they are cut off.
     limits = _lighter(content, nodes, limits)
     nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
@@ -258,8 +255,10 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
             in_box *= 2
             continue
         count = len(mesh.points)
-        nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
-        if abs(count - nodes) <= miss * nodes:
+        if nearest and abs(count - nodes) >= abs(len(nearest[0].points) - nodes):
+            break
+        nearest = [mesh]
+        if abs(count - nodes) <= LARGEST_MISS * nodes:
             break
         in_box = int(np.clip(in_box * nodes / count, max(fewest, in_box / 2), 2 * in_box))
     return nearest[0]
@@ -268,7 +267,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits:
     """The limits with larger targets, where these alone divide the region's blocks into far more nodes than asked for.
 
-    A block goes by its least target. Found by counts: a mesh of a million nodes too many takes minutes.
+    A block goes by its least target. Found by counts, as a mesh takes longer.
     """
     if limits.target is None:
         return limits
@@ -277,8 +276,8 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
     for _ in range(LIGHTER_TRIALS):
         blocks = _blocks_by_depth(content, channels, roots, limits)
         regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
-        count = len(_leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions))
-        if count <= (1.0 + TARGET_TRIAL_MISS) * nodes:
+        count = len(leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions).codes)
+        if count <= (1.0 + TARGET_MISS) * nodes:
             break
         limits = limits._replace(target=limits.target * np.float32((count / nodes) ** (1.0 / content.image.ndim)))
     return limits
@@ -289,20 +288,9 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     image = content.image
     _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
-    index = _leaf_nodes(divided, roots) / np.array(roots) * image.shape - 0.5
-    points = image.to_world(index)
-    for tie_break in TIE_BREAKS:
-        cells = delaunay(index, image.affine, tie_break)
-        if cells is None:
-            continue
-        size = volumes(points, cells)
-        least = FLAT_VOLUME_FRACTION * float(size.mean())
-        if size.min() <= least and image.ndim == 3:
-            cells = without_flat(points, cells, least)
-            size = volumes(points, cells)
-        if size.min() > least:
-            return Mesh(points, cells)
-    raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
+    joined = leaf_nodes(divided, roots)
+    points = image.to_world(joined.places() / np.array(roots) * image.shape - 0.5)
+    return Mesh(points, leaf_cells(divided, roots, joined, points))
 
 
 class _Blocks(NamedTuple):
@@ -514,13 +502,13 @@ def _division(
         # that is counted, and it rises as the threshold falls.
         n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(int(np.count_nonzero(each)) for each in divided)
         is_skipped = not regions and n_leaves > SKIPPED_RATIO * nodes
-        count = NODES_OF_LEAF * n_leaves if is_skipped else len(_leaf_nodes(divided, roots, regions))
+        count = NODES_OF_LEAF * n_leaves if is_skipped else len(leaf_nodes(divided, roots, regions).codes)
         if best_count < 0 or abs(count - nodes) < abs(best_count - nodes):
             best_count, best, is_bound = count, divided, is_skipped
         if abs(count - nodes) <= BISECTION_MISS * nodes or high <= low * (1.0 + 1e-9):
             break
         low, high = (middle, high) if count > nodes else (low, middle)
-    return len(_leaf_nodes(best, roots)) if is_bound else best_count, best
+    return len(leaf_nodes(best, roots).codes) if is_bound else best_count, best
 
 
 def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
@@ -537,32 +525,3 @@ def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDAr
             near = near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1)
         divided[depth - 1] |= near
     return divided
-
-
-def _leaves(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> Iterator[NDArray[np.int64]]:
-    """Places of the leaves of each depth, (K, n), the coarsest first."""
-    blocks = np.argwhere(np.ones(roots, dtype=bool))
-    half = np.argwhere(np.ones((2,) * len(roots), dtype=bool))
-    for is_divided in divided:
-        yield blocks[~is_divided[tuple(blocks.T)]]
-        blocks = (2 * np.argwhere(is_divided)[:, None] + half).reshape(-1, len(roots))
-    yield blocks
-
-
-def _leaf_nodes(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], regions: Sequence[NDArray[np.bool_]] = ()
-) -> NDArray[np.float64]:
-    """Corners and centres of the leaves, (N, n), in units of an undivided block; each once, in lexicographic order.
-
-    With regions, by depth, those of the leaves outside are left out.
-    """
-    n, depth = len(roots), len(divided)
-    corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
-    of_leaf = np.vstack([corner, np.ones((1, n), dtype=np.int64)])  # in halves of a leaf
-    size = (np.array(roots) << (depth + 1)) + 1  # in halves of the smallest leaves
-    steps = np.append(np.cumprod(size[:0:-1])[::-1], 1)  # in a node's number, which has its place along all axes
-    codes = []
-    for d, leaves in enumerate(_leaves(divided, roots)):
-        inside = leaves[regions[d][tuple(leaves.T)]] if regions else leaves
-        codes.append(((2 * inside @ steps)[:, None] + of_leaf @ steps << (depth - d)).ravel())
-    return np.stack(np.unravel_index(np.unique(np.concatenate(codes)), tuple(size)), axis=-1) / 2.0 ** (depth + 1)
