@@ -25,7 +25,10 @@ import numpy as np
 import tetopt
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
+from tetopt.start.label_sizes import parse_label_sizes
 from tetopt.system.files import checked_output, save_json
+
+HEAD_NODES = 130_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
     parser.add_argument("--cgal", help="a program that meshes labels by CGAL's Mesh_3, see `peers`")
+    parser.add_argument("--cgal-sized", help="another, with sizes by place, see `head`")
+    parser.add_argument("--head", type=Path, help="labels of a whole head, see `head`")
     parser.add_argument("--quick", action="store_true", help="small meshes, to try the script itself")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
@@ -46,7 +51,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     rows: dict[str, Any] = {"image": path.name, "cores": os.cpu_count(), "versions": versions()}
     rows["first_calls"] = first_calls(300)
-    rows["peers"] = peers(path, 400 if options.quick else 15_000, options.cgal, 1 if options.quick else 3)
+    counts = (400,) if options.quick else (5_000, 15_000)
+    rows["peers"] = [peers(path, nodes, options.cgal, 1 if options.quick else 3) for nodes in counts]
+    rows["labelled"] = labelled(path, counts[-1])
+    rows["masked_start"] = masked_start(path, 2_000 if options.quick else 500_000)
+    rows["stopped"] = stopped(5.0)
+    if options.head is not None:
+        rows["head"] = head(options.head, 2_000 if options.quick else HEAD_NODES, options.cgal_sized)
     sizes = (400,) if options.quick else (5_000, 15_000, 40_000)
     rows["graded"] = [graded(path, nodes) for nodes in sizes]
     rows["graded_large"] = graded(path, 400 if options.quick else 176_000, edge=256)
@@ -102,13 +113,11 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        image = tetopt.load_image(path)
-        two_classes = tetopt.Image(1.0 * (image.data > image.data.mean()), image.affine)
-        labels = mni_tissue() if path.name == mni_path("t1").name else two_classes
+        labels = _tissues(path)
         tetopt.save_image(folder / "labels.nii.gz", labels)
         ours = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(folder / "ours.vtu"), "--force"]
         commands = {"tetopt": [*ours, "--nodes", str(nodes)]}
-        rows: dict[str, Any] = {}
+        rows: dict[str, Any] = {"nodes": nodes}
         if importlib.util.find_spec("pytetwild") is None:
             rows["pytetwild"] = "not installed"
         else:
@@ -117,7 +126,7 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
         if cgal is None:
             rows["cgal"] = "no program named (--cgal)"
         else:
-            commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
+            commands["cgal"], rows["cgal_nodes"] = _cgal_command([cgal], labels, None, nodes, folder)
         seconds: dict[str, list[tuple[float, float]]] = {}
         for _ in range(turns):
             for name, command in commands.items():
@@ -131,22 +140,116 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
     return rows
 
 
-def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
-    """The command of the size that gives about so many nodes, and how many those are; at most six runs to find it."""
-    # Label 0 is left out by CGAL: all are raised by one. Padded by a voxel, so that the outer ones are meshed whole.
-    raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")
+def _cgal_command(
+    program: list[str], labels: tetopt.Image, sizes: tetopt.Image | None, nodes: int, folder: Path
+) -> tuple[list[str], int]:
+    """The command that gives about so many nodes, and how many those are; at most six runs to find it.
+
+    The size is one number, or the sizes by place, mm, times one.
+    """
+    # Label 0 is left out by CGAL: all are raised by one where it is meshed, too. Padded by a voxel, so that the outer
+    # ones are meshed whole.
+    data = labels.data.astype(np.uint8) + np.uint8(sizes is None)
+    raised = np.pad(data, 1, mode="edge" if sizes is None else "constant")
     raised.transpose(2, 1, 0).tofile(folder / "labels.raw")
     spacing = np.sqrt((labels.affine[:3, :3] ** 2).sum(axis=0))
-    size = 1.8 * (labels.volume / nodes) ** (1 / 3)
+    size = 1.8 * (labels.volume / nodes) ** (1 / 3) if sizes is None else 3.0
     for _ in range(6):
-        numbers = [*map(str, raised.shape), *map(str, spacing)]
-        command = [program, str(folder / "labels.raw"), *numbers, str(folder / "mesh.bin"), str(size)]
+        numbers = [*map(str, raised.shape), *map(str, spacing), str(folder / "mesh.bin")]
+        if sizes is None:
+            command = [*program, str(folder / "labels.raw"), *numbers, str(size)]
+        else:
+            field = np.pad(size * sizes.data, 1, mode="edge").astype(np.float32)
+            field.transpose(2, 1, 0).tofile(folder / "sizes.raw")
+            command = [*program, str(folder / "labels.raw"), str(folder / "sizes.raw"), *numbers, "1"]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         n_nodes = int(json.loads(done.stdout)["nodes"])
         if abs(n_nodes / nodes - 1.0) < 0.03:
             break
         size *= (n_nodes / nodes) ** (1 / 2.2)
     return command, n_nodes
+
+
+def labelled(path: Path, nodes: int) -> dict[str, Any]:
+    """The whole process with the tissues as labels, within them, and without, in turns: the least of two each."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tetopt.save_image(folder / "labels.nii.gz", _tissues(path))
+        plain = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(folder / "out.vtu"), "--force"]
+        plain += ["--nodes", str(nodes)]
+        named = [*plain, "--labels", str(folder / "labels.nii.gz"), "--background", "0"]
+        times = [(process_seconds(plain), process_seconds(named)) for _ in range(2)]
+        without, within = (tuple(map(min, zip(*each, strict=True))) for each in zip(*times, strict=True))
+    return {"nodes": nodes, "wall": within[0], "cpu": within[1], "over_plain": within[0] / without[0]}
+
+
+def masked_start(path: Path, nodes: int) -> dict[str, Any]:
+    """The octree within a mask and a field of sizes, in a process of its own: seconds, memory."""
+    program = (
+        "import json, resource, sys, time, numpy as np, tetopt\n"
+        "image, mask, nodes = tetopt.load_image(sys.argv[1]), tetopt.load_image(sys.argv[2]), int(sys.argv[3])\n"
+        "from tetopt.start.octree import nearest_octree\n"
+        "content = tetopt.content(image, mask=mask)\n"
+        "ramp = np.linspace(1.2, 3.6, image.shape[0])[:, None, None] + np.zeros(image.shape)\n"
+        "sizes = tetopt.Sizes(field=tetopt.Image(ramp, image.affine))\n"
+        "begin, cpu = time.perf_counter(), time.process_time()\n"
+        "mesh = nearest_octree(content, nodes, sizes)\n"
+        "print(json.dumps({'nodes': len(mesh.points), 'wall': time.perf_counter() - begin,\n"
+        "    'cpu': time.process_time() - cpu,\n"
+        "    'peak_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}))\n"
+    )
+    with tempfile.TemporaryDirectory() as name:
+        mask = Path(name) / "mask.nii.gz"
+        tissues = _tissues(path)
+        tetopt.save_image(mask, tetopt.Image(1.0 * (tissues.data > 0), tissues.affine))
+        command = [sys.executable, "-c", program, str(path), str(mask), str(nodes)]
+        return json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+
+
+def stopped(seconds: float) -> dict[str, float]:
+    """A slab of 5 x 5 x 23 voxels with 2,000 nodes, to be stopped after so many seconds: the seconds it takes."""
+    rows = {}
+    labels = tetopt.Image((np.indices((5, 5, 23))[2] > 11).astype(float))
+    for kind, content in {"plain": labels, "labels": tetopt.content(labels, labels)}.items():
+        tetopt.mesh_image(content, 100, iterations=2)
+        begin = time.perf_counter()
+        tetopt.mesh_image(content, 2_000, max_seconds=seconds)
+        rows[kind] = time.perf_counter() - begin
+    return {"asked": seconds, **rows}
+
+
+def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
+    """A head of five tissues within its mask, by the command of docs/measured/labels.md, and CGAL's after it.
+
+    CGAL is a program `cgal LABELS.raw SIZES.raw nx ny nz sx sy sz OUT.bin 1` that perturbs and exudes, and prints JSON
+    with `nodes`; its sizes are those that tetopt asks for by tissue and thickness, times a factor that gives about as
+    many nodes.
+    """
+    image, words = tetopt.load_image(path), "1=0.7t[1:4],2=0.9t[1.5:6],3=1t[1.2:6],4=1.3t[1.5:7],*=1t[2:10]"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        out = folder / "out.vtu"
+        command = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(out), "--labels", str(path)]
+        command += ["--background", "0", "--size-min", "1", "--nodes", str(nodes), "--label-size", words]
+        wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"])
+        rows = {"nodes": nodes, "cells": len(tetopt.read_mesh(out).cells), "wall": wall, "cpu": cpu}
+        rows["peak_gb"] = json.loads((folder / "run.json").read_text())["memory"]["peak_bytes"] / 1e9
+        if cgal is not None:
+            by_label = parse_label_sizes(words)
+            made = tetopt.sizes_by_label(tetopt.Sizes(smallest=1.0, by_label=by_label), tetopt.content(image, image))
+            sizes = tetopt.Image(made.sizes.on_voxels(image), image.affine)
+            program, rows["cgal_nodes"] = _cgal_command([cgal], image, sizes, nodes, folder)
+            rows["cgal"] = dict(zip(("wall", "cpu"), process_seconds(program), strict=True))
+            rows["over_cgal"] = {clock: rows[clock] / rows["cgal"][clock] for clock in ("wall", "cpu")}
+    return rows
+
+
+def _tissues(path: Path) -> tetopt.Image:
+    """The tissue labels that come with the MNI152 T1, or two classes of another image."""
+    if path.name == mni_path("t1").name:
+        return mni_tissue()
+    image = tetopt.load_image(path)
+    return tetopt.Image(1.0 * (image.data > image.data.mean()), image.affine)
 
 
 def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
@@ -184,9 +287,12 @@ def show(rows: dict[str, Any]) -> None:
             f"  first call, {kind:22s}{seconds['wall']:10.1f} s of compiling ({seconds['cpu']:.0f} of CPU); whole "
             f"process with the kernels in the cache {seconds['again']:.1f} s"
         )
-    for name, row in rows["peers"].items():
-        words = f"{row['wall']:.1f} s, {row['cpu']:.1f} of CPU" if isinstance(row, dict) else row
-        print(f"  peers, whole process: {name} {words}")
+    for peer in rows["peers"]:
+        for name, row in peer.items():
+            words = f"{row['wall']:.1f} s, {row['cpu']:.1f} of CPU" if isinstance(row, dict) else row
+            print(f"  peers, whole process: {name} {words}")
+    for name in ("labelled", "masked_start", "stopped", "head"):
+        print(f"  {name}: {json.dumps(rows.get(name, 'no labels named (--head)'))}")
     for row in [*rows["graded"], rows["graded_large"]]:
         print(
             f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s, peak "
