@@ -81,8 +81,8 @@ class Engine:
         self.state, n_flips = flip(self.state, passes=passes)
         return n_flips
 
-    def repair(self, degrees):
-        repaired = repair(self.state, degrees)
+    def repair(self, degrees, is_over=lambda: False):
+        repaired = repair(self.state, degrees, is_over)
         self.state = repaired.state
         return repaired
 

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from states import ball
+from meshes import delaunay_box
+from states import Engine, ball
 
 import tetopt
 from tetopt.energy.sampling import overlap_of
@@ -154,3 +155,21 @@ def test_parts_stopped_anywhere_are_sound(tmp_path):
         )
         assert_sound(parted.result, image, None, None)
     assert n_kept > 0
+
+
+def test_cells_are_lifted_no_longer_than_a_run_has_time():
+    """A question in each round, and for some cells at a time; once over, the round's splits are the last moves."""
+    image = target(3)[0]
+    mesh = tetopt.Mesh(*delaunay_box(np.random.default_rng(0), image.shape, 150))
+    of = lambda: Engine(image, mesh)  # noqa: E731
+    never = Asked()
+    n_all = of().repair(15.0, never).n_moves
+    assert never.number > 4
+    n_moves = []
+    for k in (1, 2, never.number // 2, never.number):
+        engine, asked = of(), Asked(k)
+        n_moves.append(engine.repair(15.0, asked).n_moves)
+        assert k <= asked.number <= k + 2
+        engine.assert_sound()
+    assert n_moves == sorted(n_moves)
+    assert n_moves[0] == 0 < n_moves[2] <= n_all

@@ -36,6 +36,7 @@ from tetopt.engine.loop import (
     Whole,
     check_common_options,
     deadline,
+    grace,
     relative_movement,
 )
 from tetopt.engine.paper import optimize_paper
@@ -123,8 +124,8 @@ def optimize(
     tolerance : float
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
-        Stop at the next colour of nodes after this time; the mesh is valid, and its minimum dihedral angle is seen to,
-        which, like the flips of an iteration, takes its time besides.
+        Stop at the next colour of nodes after this time; the mesh is valid. Cells are lifted above the minimum dihedral
+        angle for a tenth of the run's time more, or a second; flips of an iteration and labels take theirs besides.
     callback : callable, optional
         Called with each `IterationRecord`; without one a notebook shows a bar. Its E_G is the weighted one, its
         `is_retessellated` whether cells were exchanged.
@@ -217,6 +218,7 @@ def followed(
     record(course.first - 1, 0.0, False)
     if course.iterations > 0:
         run.keep_min_dihedral(min_dihedral)
+    is_late = grace(begin, is_over)
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
     for iteration in range(course.first, course.last + 1):
         before = run.state.complex.ticks.copy()
@@ -240,7 +242,7 @@ def followed(
         # 4. Lift flat cells and mend what is not a manifold: in the last iteration. Parts do so in every
         # round, as in the next one what is under it may have nodes that stay.
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
-        n_lifted, n_gone = run.mend(course.carves, min_dihedral) if is_last else (0, 0)
+        n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
         # 5. Measure.
         record(iteration, movement, n_changes > 0)
@@ -444,21 +446,22 @@ class Run:
         """Tetrahedra with an angle under `degrees`."""
         return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
-    def mend(self, carves: bool, min_dihedral: float) -> tuple[int, int]:
+    def mend(self, carves: bool, min_dihedral: float, is_late: Callable[[], bool]) -> tuple[int, int]:
         """Lift cells above `min_dihedral`, degrees, and mend surfaces: again where cells that were taken out made room.
 
-        Returns the number of moves, and of cells taken out.
+        Cells stay flat once `is_late` says so; surfaces are mended all the same. Returns the number of moves, and of
+        cells taken out.
         """
         n_lifted = n_gone = 0
         for _ in range(MEND_ROUNDS):
-            n_lifted += self.lift(min_dihedral, carves) if self.n_below(min_dihedral) > 0 else 0
+            n_lifted += self.lift(min_dihedral, carves, is_late) if self.n_below(min_dihedral) > 0 else 0
             n_new = self.mend_surfaces(carves, min_dihedral)
             n_gone += n_new
-            if n_new == 0 or self.n_below(min_dihedral) == 0:
+            if n_new == 0 or self.n_below(min_dihedral) == 0 or is_late():
                 break
         return n_lifted, n_gone
 
-    def lift(self, degrees: float, carves: bool = False) -> int:
+    def lift(self, degrees: float, carves: bool = False, is_late: Callable[[], bool] = lambda: False) -> int:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
 
         On the surface of a mask whose details are as small as the cells it may lay cells over one another: more than
@@ -466,7 +469,7 @@ class Run:
         angle.
         """
         before = self.state if self.content.region is None else copied(self.state)
-        made = repair(self.state, degrees)
+        made = repair(self.state, degrees, is_late)
         if self.content.region is not None:
             n_over = int(self._overlapping(made.state).sum())
             if n_over > (self.most_gone if carves else 0):

@@ -7,6 +7,7 @@ by the smallest dihedral angle of the cells they touch: a move is made only if t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,7 @@ from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
 from tetopt.system.kernels import Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
+DISPLACED_AT_ONCE = 200  # cells between two questions whether time is over: up to 0.1 s, of 0.4 ms each
 STEP_HALVINGS = 7  # of a node's displacement
 FIRST_STEP_EDGES = 0.25  # of the star's mean edge: the first displacement
 WORST_WEIGHT = 40.0  # a steep sum stands for the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
@@ -74,35 +76,45 @@ def _fill_cosines(cosines: Floats1, state: State) -> None:
         cosines[cell] = cell_cosine(x, state, cell)
 
 
-def repair(state: State, min_dihedral: float) -> Repaired:
+def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lambda: False) -> Repaired:
     """Lift every cell's smallest dihedral angle to `min_dihedral`, degrees, as far as moves can.
 
     Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
-    put in or taken out; until no cell is left, or a round changes nothing.
+    put in or taken out; until no cell is left, a round changes nothing, or `is_over` says so.
     """
     target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
     for _ in range(REPAIR_ROUNDS):
         bad = _worst_first(state, target)
-        if len(bad) == 0:
+        if len(bad) == 0 or is_over():
             break
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
             state = grown(state)
         n_made = _reconnect(state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2]))
         bad = _worst_first(state, target)
         if len(bad):
-            n_made += _displace(state, node_stars(state), bad, target)
+            n_made += _displaced(state, bad, target, is_over)
         bad = _worst_first(state, target)
         if n_made == 0 and len(bad):
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)
         if n_made == 0 and len(bad):  # nodes between labels may leave the surfaces that they lie on
-            n_made = _displace(_released(state), node_stars(state), bad, target)
+            n_made = _displaced(_released(state), bad, target, is_over)
         n_moves += n_made
         if n_made == 0:
             break
     return Repaired(state, source, len(_worst_first(state, target)), n_moves)
+
+
+def _displaced(state: State, bad: NDArray[np.int64], target: float, is_over: Callable[[], bool]) -> int:
+    """`_displace` until `is_over` says so: tens of thousands of cells far below voxels took minutes."""
+    stars, n_made = node_stars(state), 0
+    for begin in range(0, len(bad), DISPLACED_AT_ONCE):
+        if is_over():
+            break
+        n_made += _displace(state, stars, bad[begin : begin + DISPLACED_AT_ONCE], target)
+    return n_made
 
 
 def _released(state: State) -> State:

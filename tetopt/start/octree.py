@@ -495,7 +495,7 @@ def _division(
     del above
     regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
     best_count, best, is_bound = -1, [], False
-    for _ in range(BISECTION_STEPS):
+    for _ in range(BISECTION_STEPS if ends else 1):  # whatever the threshold, where no block may be divided
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
         # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number
