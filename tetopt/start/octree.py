@@ -271,7 +271,7 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
     """
     if limits.target is None:
         return limits
-    roots = next(_root_counts(content.image, nodes, limits))
+    roots = next(_root_counts(content, nodes, limits))
     channels = channels_of(content)
     for _ in range(LIGHTER_TRIALS):
         blocks = _blocks_by_depth(content, channels, roots, limits)
@@ -442,7 +442,7 @@ def _best_division(
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     image, channels = content.image, channels_of(content)
-    for roots in _root_counts(image, nodes, limits):
+    for roots in _root_counts(content, nodes, limits):
         if (np.array(image.shape) / roots).max() < LEAF_VOXELS and best is not None:
             break
         edge = image.spacing * image.shape / np.array(roots)
@@ -463,12 +463,20 @@ def _best_division(
     return best[1:]
 
 
-def _root_counts(image: Image, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
-    """Numbers of roots along each axis to try, within the limits: the largest blocks first."""
-    largest, smallest = limits.largest, limits.smallest
+def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
+    """Numbers of roots along each axis to try, within the limits: the largest blocks first.
+
+    With a region at last the lattice that has the nodes within it: of leaves that are as small as they may be no
+    coarser one has as many.
+    """
+    image, largest, smallest = content.image, limits.largest, limits.smallest
     lengths = image.spacing * image.shape
     kind = "bcc" if image.ndim == 3 else "criss-cross"
     coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * fraction))) for fraction in ROOT_FRACTIONS]
+    if content.inside is not None:
+        within = near_cubes(kind, lengths, int(nodes / content.inside.mean()))
+        finest = np.maximum(np.array(image.shape) / LEAF_VOXELS, coarse[-1])
+        coarse.append(tuple(int(c) for c in np.minimum(within, finest)))
     edges = [lengths / roots for roots in coarse]
     fit = [e.max() <= largest * (1.0 + 1e-9) and e.min() >= smallest for e in edges]
     if limits.target is not None and (widest := float(limits.target.max())) < NO_BOUND_MM:
