@@ -511,3 +511,20 @@ def row_totals(field, block_of_row, ends, totals):
                 block = next(c for c in range(len(ends) - 1) if ends[c] <= k < ends[c + 1])
                 totals[p][block_of_row[r]][block] += float(value)
     return totals
+
+
+def facet_distance(p, corners):
+    """From a point to a segment, or a triangle: at its foot if that is inside, else to the nearest edge."""
+    if len(corners) == 2:
+        a, b = corners
+        along = b - a
+        t = np.clip((p - a) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+        return np.linalg.norm(p - a - t * along)
+    nearest = min(facet_distance(p, corners[[i, k]]) for i, k in ((0, 1), (1, 2), (2, 0)))
+    frame = (corners[1:] - corners[0]).T
+    if np.linalg.matrix_rank(frame, tol=1e-7) < 2:
+        return nearest
+    u, v = np.linalg.lstsq(frame, p - corners[0], rcond=None)[0]
+    if min(u, v, 1.0 - u - v) < 0.0:
+        return nearest
+    return np.linalg.norm(p - corners[0] - frame @ [u, v])

@@ -117,6 +117,27 @@ class Image:
         vars(self).update(voxels=whole)  # boxes are read from it from now on
         return whole
 
+    @cached_property
+    def range(self) -> tuple[float, float]:
+        """The least and the greatest intensity; this and the next three are found once, as each is a pass over all."""
+        return float(self.data.min()), float(self.data.max())
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean of the intensities."""
+        return float(np.mean(self.data, dtype=np.float64))
+
+    @cached_property
+    def variance(self) -> float:
+        """Variance of the intensities, divided by the number of voxels."""
+        with np.errstate(over="ignore"):
+            return float(np.var(self.data, dtype=np.float64))
+
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether all intensities are whole numbers."""
+        return np.array_equal(np.rint(self.data), self.data)
+
     @property
     def is_stored(self) -> bool:
         """Whether the voxels are where they are stored, and have not been read as a whole."""

@@ -149,6 +149,8 @@ class Content(NamedTuple):
         """Variance over the voxels to be covered, of all channels, intensity^2; times `volume`: E_D of one cell."""
         if self.statistics is not None and self.is_plain and self.region is None:
             return self.statistics.variance
+        if self.is_plain and self.region is None:
+            return self.image.variance
         return self.unit * sum(_variance(values, self.region) for values in self.values)
 
     @property
@@ -156,9 +158,7 @@ class Content(NamedTuple):
         """Of the intensities of the image's voxels, whichever are to be covered."""
         if self.statistics is not None:
             return Spread(*self.statistics[:4])
-        data = self.image.data
-        mean, low, high = float(data.mean(dtype=np.float64)), float(data.min()), float(data.max())
-        return Spread(mean, low, high, _variance(data, None))
+        return Spread(self.image.mean, *self.image.range, self.image.variance)
 
     @property
     def wrong_side(self) -> float:

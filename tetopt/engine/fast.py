@@ -281,11 +281,11 @@ def prepare_kernels(
             "repair": image.ndim == 3,
             "interfaces": has_labels,
             "labelling": has_labels,
+            "nearest": has_labels or content.region is not None,  # what they are measured by afterwards
             "paper_moves": False,
         }
         link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)], progress)
-    is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
-    step = 1.0 if is_whole else 0.1
+    step = 1.0 if not content.is_plain or image.is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice_mesh(tiny, blocks=(1,) * image.ndim)
     if has_labels:

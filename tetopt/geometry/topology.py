@@ -61,7 +61,7 @@ def facets(cells: NDArray[np.integer]) -> Facets:
         sign = np.where(columns[i] < columns[k], sign, -sign)
         columns[i], columns[k] = np.minimum(columns[i], columns[k]), np.maximum(columns[i], columns[k])
     columns = [column.ravel() for column in columns]
-    order, is_first = _lexicographic_order(columns)
+    order, is_first = lexicographic_order(columns)
     of_cell = np.empty(len(order), dtype=np.int64)
     of_cell[order] = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)
@@ -73,7 +73,7 @@ def facets(cells: NDArray[np.integer]) -> Facets:
     return Facets(listed, sides, n_cells, of_cell.reshape(cells.shape), sign)
 
 
-def _lexicographic_order(columns: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def lexicographic_order(columns: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Stable order of rows of node numbers, (n,) columns (K,), and whether each row in it is the first of its kind."""
     base = max(int(column.max()) for column in columns) + 1
     if base ** len(columns) >= 2**63:

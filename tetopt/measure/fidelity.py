@@ -22,8 +22,9 @@ from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box
+from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
-from tetopt.geometry.topology import Facets, components, facets
+from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
@@ -31,7 +32,6 @@ POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
 MOST_POINTS = 20_000  # on a surface, from which distances are measured
 FEWEST_POINTS = 1_000  # the same on the larger of two surfaces, however small
 POINTS_PER_FACE = 4.0  # on an area as large as a voxel's face: the half level bends no faster than that
-FLAT_AREA_FRACTION = 1e-6  # of the square of a triangle's size: one with less area is flat
 # Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1 (Roberts 2018).
 EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
@@ -419,33 +419,15 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     )
 
 
-def surface_distances(
-    points: NDArray[np.float64], surface: FacetSurface, is_flat: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDArray[np.float64]:
     """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit; exact.
 
-    The surface has one facet or more; `is_flat` (T,) are those without an area, which count, too.
+    The surface has one facet or more; flat ones count, too.
     """
-    import pyvista
-    from vtkmodules.vtkCommonCore import mutable
-    from vtkmodules.vtkCommonDataModel import vtkGenericCell, vtkStaticCellLocator
-
-    if points.shape[1] == 3:
-        edges = surface.facets[is_flat][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        grid = pyvista.PolyData(surface.points, faces=_vtk_cells(surface.facets), lines=_vtk_cells(edges))
-    else:
-        points = _in_space(points)
-        grid = pyvista.PolyData(_in_space(surface.points), lines=_vtk_cells(surface.facets))
-    # Not compute_implicit_distance: it looks for the side too, and crashes on flat triangles.
-    locator, cell = vtkStaticCellLocator(), vtkGenericCell()
-    locator.SetDataSet(grid)
-    locator.BuildLocator()
-    of_cell, of_part, square, place = mutable(0), mutable(0), mutable(0.0), [0.0, 0.0, 0.0]
-    nearest: list[float] = []
-    for point in points.tolist():
-        locator.FindClosestPoint(point, place, cell, of_cell, of_part, square)  # type: ignore[call-overload]
-        nearest.extend(place)
-    return np.linalg.norm(np.array(nearest).reshape(points.shape) - points, axis=1)
+    corners = surface.points[surface.facets]
+    if points.shape[1] == 2:  # segments are flat triangles
+        points, corners = np.pad(points, ((0, 0), (0, 1))), np.pad(corners[:, [0, 1, 1]], ((0, 0), (0, 0), (0, 1)))
+    return triangle_distances(points, corners)
 
 
 def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -469,11 +451,13 @@ def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] 
 
 def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
     """Points less edges plus triangles of a surface (T, 3); points less segments of a curve (T, 2)."""
-    n = surface_facets.shape[1]
-    total = 0
-    for size in range(1, n + 1):
-        corners = np.vstack([surface_facets[:, list(chosen)] for chosen in combinations(range(n), size)])
-        total += (-1) ** (size - 1) * len(np.unique(np.sort(corners, axis=1), axis=0))
+    if len(surface_facets) == 0:
+        return 0
+    nodes, total = np.sort(surface_facets, axis=1).T, 0
+    for size in range(1, len(nodes) + 1):
+        chosen = np.array(list(combinations(range(len(nodes)), size)))
+        is_new = lexicographic_order([nodes[column].ravel() for column in chosen.T])[1]
+        total += (-1) ** (size - 1) * int(np.count_nonzero(is_new))
     return total
 
 
@@ -560,33 +544,24 @@ def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDA
     """From points of each of two surfaces to the other, equally dense on both; no points if a surface is empty."""
     if len(one.facets) == 0 or len(other.facets) == 0:
         return np.empty(0), np.empty(0)
-    (areas, is_flat), (areas_there, is_flat_there) = _areas_and_flat(one), _areas_and_flat(other)
+    areas, areas_there = surface_areas(one), surface_areas(other)
     total, total_there = float(areas.sum()), float(areas_there.sum())
     largest = max(total, total_there)
     density = min(max(POINTS_PER_FACE / face, FEWEST_POINTS / largest), MOST_POINTS / largest)
     spread = evenly_spread(one, max(ceil(density * total), 1), areas)
     spread_there = evenly_spread(other, max(ceil(density * total_there), 1), areas_there)
-    return surface_distances(spread, other, is_flat_there), surface_distances(spread_there, one, is_flat)
+    return surface_distances(spread, other), surface_distances(spread_there, one)
 
 
 def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
     """Area of each triangle, length of each segment, (T,) float64."""
-    return _areas_and_flat(surface)[0]
-
-
-def _areas_and_flat(surface: FacetSurface) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`surface_areas`, and which triangles are flat; no segment is."""
     nodes = surface.facets.T
     corners = [np.ascontiguousarray(axis)[nodes] for axis in surface.points.T]  # axis by axis: three times as fast
     along = [corner[1:] - corner[0] for corner in corners]
     if len(along) == 2:
-        return np.hypot(along[0][0], along[1][0]), np.zeros(len(surface.facets), dtype=bool)
+        return np.hypot(along[0][0], along[1][0])
     (ax, bx), (ay, by), (az, bz) = along
-    areas = 0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
-    size = np.zeros(len(areas))
-    for a, b, c in corners:  # not by `max` over an axis of three, which takes five times as long
-        np.maximum(size, np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c), out=size)
-    return areas, areas <= FLAT_AREA_FRACTION * size**2
+    return np.asarray(0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2))
 
 
 def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
@@ -601,15 +576,6 @@ def _dice(both: float, one: float, other: float) -> float:
 
 def _n_components(cells: NDArray[np.int64]) -> int:
     return int(components(cells).max()) + 1 if len(cells) else 0
-
-
-def _in_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.column_stack([points, np.zeros(len(points))])
-
-
-def _vtk_cells(cells: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Cells as VTK lists them: the points of each come after their number."""
-    return np.insert(cells, 0, cells.shape[1], axis=1).ravel() if len(cells) else None
 
 
 class ImageFit(NamedTuple):

@@ -93,26 +93,25 @@ def _kinds_of(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArr
         is_needle = edges.min(axis=1) < SHORT_EDGE**2 * edges.max(axis=1)
         kinds[is_bad] = np.where(is_needle, "needle", "cap")
     else:
-        kinds[is_bad] = [_tet_kind(corners) for corners in points[cells[is_bad]]]
+        kinds[is_bad] = _tet_kinds(points[cells[is_bad]])
     return kinds
 
 
-def _tet_kind(corners: NDArray[np.float64]) -> str:
-    """Kind of one bad tetrahedron, corners (4, 3)."""
-    centred = corners - corners.mean(axis=0)
+def _tet_kinds(corners: NDArray[np.float64]) -> NDArray[np.str_]:
+    """Kinds of bad tetrahedra, corners (B, 4, 3)."""
+    centred = corners - corners.mean(axis=1, keepdims=True)
     _, spread, axes = np.linalg.svd(centred)
-    if spread[1] ** 2 <= spread[0] * spread[2]:
-        return "needle"
-    flat = centred @ axes[:2].T
-    edges = squared_edges(corners, np.array([[0, 1, 2, 3]]))[0]
-    if edges.min() < SHORT_EDGE**2 * edges.max():
-        return "wedge"
+    is_thin = spread[:, 1] ** 2 <= spread[:, 0] * spread[:, 2]
+    edges = squared_edges(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4))
+    is_wedge = edges.min(axis=1) < SHORT_EDGE**2 * edges.max(axis=1)
     # The affine dependence of four points in a plane, sum c_k = 0 and sum c_k x_k = 0: its signs are 3 + 1 if one
     # point lies inside the triangle of the others, 2 + 2 for a convex quadrilateral; a 0 is a point on an edge.
-    dependence = np.linalg.svd(np.vstack([flat.T, np.ones(4)]))[2][-1]
-    if np.abs(dependence).min() < NEAR_EDGE * np.abs(dependence).max():
-        return "spade"
-    return "sliver" if np.sum(dependence > 0) == 2 else "cap"
+    flat = axes[:, :2] @ centred.swapaxes(1, 2)
+    dependence = np.linalg.svd(np.concatenate([flat, np.ones((len(flat), 1, 4))], axis=1))[2][:, -1]
+    size = np.abs(dependence)
+    is_spade = size.min(axis=1) < NEAR_EDGE * size.max(axis=1)
+    is_sliver = (dependence > 0).sum(axis=1) == 2
+    return np.select([is_thin, is_wedge, is_spade, is_sliver], ["needle", "wedge", "spade", "sliver"], "cap")
 
 
 class Quality(NamedTuple):

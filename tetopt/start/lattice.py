@@ -135,9 +135,9 @@ def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int
     per_block = 1 if kind == "five-tet" else 2
     edge = (np.prod(lengths) * per_block / nodes) ** (1.0 / len(lengths))
     candidates: set[tuple[int, ...]] = set()
-    for size in edge * np.linspace(0.7, 2.0, 400):
-        ideal = lengths / size
-        candidates.update(product(*[{max(1, int(x)), int(x) + 1} for x in ideal]))
+    sizes = edge * np.linspace(0.7, 2.0, 400)
+    for fewer in set(map(tuple, (lengths / sizes[:, None]).astype(np.int64).tolist())):
+        candidates.update(product(*[{max(1, count), count + 1} for count in fewer]))
 
     def merit(blocks: tuple[int, ...]) -> tuple[float, float, tuple[int, ...]]:
         edges = lengths / np.array(blocks)

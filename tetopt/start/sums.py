@@ -40,14 +40,15 @@ class Channels(NamedTuple):
 
 
 def channels_of(content: Content) -> Channels:
-    """The channels of a content, from one pass over its voxels where their statistics are not known.
+    """The channels of a content, from one pass over its voxels where they are stored and their statistics not known.
 
     Raises
     ------
     InputError
         Deviations whose squares overflow; of a stored image voxels that no `Image` takes.
     """
-    if content.is_plain and content.region is None and content.image.ndim == 3:
+    is_known = content.statistics is not None or content.image.in_memory is None  # else half of it will do
+    if content.is_plain and content.region is None and content.image.ndim == 3 and is_known:
         known = statistics(content.image) if content.statistics is None else content.statistics
         _check_squares(known.scale, content.n_voxels)
         return Channels([known.mean], known.scale, known.scaled_noise, 0.0)
