@@ -36,6 +36,7 @@ NEAR_SURFACE = 0.05, 0.95  # distance from the surface of a voxel beside it: les
 MOST_LIFTED = 1.0  # voxels by which smoothing changes levels further off: what distances to voxels can be wrong by
 LEAST_SLOPE = 0.3  # of a level that volumes are measured with; flatter ones are those of sheets of a voxel
 FLOW_STEPS = 4  # more do not bring spheres of 3 to 20 voxels, or shells of 2 to 6, any nearer to the true ones
+ROUNDING_VOXELS = 1e-6  # by which places in a cell may lie beyond its corners
 ABSENT_DISTANCE = 1e4  # voxels to what is not in a slice at all
 
 
@@ -199,6 +200,43 @@ def _labels_at(partition: NDArray, levels: NDArray, channel: NDArray, index: NDA
             if level < least or (level == least and label < best):
                 best, least = label, level
         row[p] = best
+    return row
+
+
+def labels_around(members: Memberships, index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The row of the one label that all voxels in and around each cell have, (M,), so that `labels_at` finds no other.
+
+    -1 where they have several. Nodes lie at index positions (N, n).
+    """
+    partition = members.partition.reshape((1,) * (3 - index.shape[1]) + members.partition.shape)
+    place = np.zeros((len(index), 3))
+    place[:, 3 - index.shape[1] :] = index
+    return np.asarray(_labels_around(partition, place, cells))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _labels_around(partition: NDArray, place: NDArray, cells: NDArray) -> NDArray:
+    row, first, last = np.empty(len(cells), dtype=np.int64), np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for cell in range(len(cells)):
+        for d in range(3):
+            low, high = np.inf, -np.inf
+            for k in range(cells.shape[1]):
+                low, high = min(low, place[cells[cell, k], d]), max(high, place[cells[cell, k], d])
+            end = max(partition.shape[d] - 2, 0)
+            first[d] = min(int(max(low - ROUNDING_VOXELS, 0.0)), end)
+            last[d] = min(min(int(max(high + ROUNDING_VOXELS, 0.0)), end) + 1, partition.shape[d] - 1)
+        label = partition[first[0], first[1], first[2]]
+        row[cell] = label
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                for k in range(first[2], last[2] + 1):
+                    if partition[i, j, k] != label:
+                        row[cell] = -1
+                        break
+                if row[cell] < 0:
+                    break
+            if row[cell] < 0:
+                break
     return row
 
 
