@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, SmoothLabels
-from tetopt.contents.memberships import Memberships, labels_around, labels_at
+from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
 from tetopt.engine.labelling import (
@@ -38,7 +38,7 @@ from tetopt.system.kernels import Bools1, Floats1, Ints1, entry, helper, unit
 
 FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
 SAMPLED_FRACTION = 0.5  # of a label's voxels: of one that samples show less of its centres are counted, too
-SAMPLED_AT_ONCE = 20_000  # cells: 10 MB of places on each thread
+SAMPLED_AT_ONCE = 20_000  # cells, by each thread
 BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
 SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
 SPARED_LOSS_FRACTION = 0.08  # of a label's volume: to make up for all of it where it is left costs its place, Dice
@@ -145,20 +145,14 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy
     cell, row, weight = [owner[is_counted]], [members.partition.ravel()[is_counted]], [np.ones(is_counted.sum())]
     sampled, inner = np.flatnonzero(is_sampled), PART_CENTRES[image.ndim]
     each = np.abs(volumes(mesh.points, mesh.cells[sampled])) / image.voxel_volume / len(inner)
-    only = labels_around(members, image.to_index(mesh.points), mesh.cells[sampled])
-    is_mixed = only < 0  # the others need no samples: half of the cells of a head
-    cell.append(sampled[~is_mixed])
-    row.append(only[~is_mixed])
-    weight.append(_times(len(inner), each[~is_mixed]))
-
-    def sampled_labels(part: NDArray[np.int64]) -> NDArray[np.int64]:
-        return labels_at(members, image.to_index((inner @ mesh.points[mesh.cells[part]]).reshape(-1, image.ndim)))
-
-    mixed = sampled[is_mixed]
+    index, parts = image.to_index(mesh.points), np.array_split(mesh.cells[sampled], 1 + len(sampled) // SAMPLED_AT_ONCE)
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        row += threads.map(sampled_labels, np.array_split(mixed, 1 + len(mixed) // SAMPLED_AT_ONCE))
-    cell.append(np.repeat(mixed, len(inner)))
-    weight.append(np.repeat(each[is_mixed], len(inner)))
+        there = np.concatenate(list(threads.map(lambda part: labels_at(members, index, part, inner), parts)))
+    is_one = (there == there[:, :1]).all(axis=1)  # its weights are added up here, one by one, as of the others there
+    cell += [sampled[is_one], np.repeat(sampled[~is_one], len(inner))]
+    row += [there[is_one, 0], there[~is_one].ravel()]
+    whole = np.cumsum(np.broadcast_to(each[is_one, None], (is_one.sum(), len(inner))), axis=1)[:, -1]
+    weight += [whole, np.repeat(each[~is_one], len(inner))]
     # Between the samples a label of a voxel or two is not seen: it has its centres.
     rows = members.partition.ravel()[owner >= 0]
     seen = np.bincount(np.concatenate(row), np.concatenate(weight), shape[1])
@@ -168,14 +162,6 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy
     weight.append(np.ones(is_unseen.sum()))
     every = np.concatenate(weight), (np.concatenate(cell), np.concatenate(row))
     return scipy.sparse.csr_array(every, shape=shape), contacts
-
-
-def _times(number: int, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A number of equal weights, added up one by one as those of samples are."""
-    total = np.zeros(len(weight))
-    for _ in range(number):
-        total += weight
-    return total
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:

@@ -676,9 +676,11 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
     """The rows of `_nonmanifold` and the number of labels that meet there, (F, 3); their count."""
     count, is_around = 0, _around(dual, is_near)
     for a in range(len(is_around)):
-        if not (is_around[a] and _is_mixed(dual, labels, a)):
+        if not is_around[a]:
             continue
-        fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 1)
+        fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 2)
+        if n_labels == 1:
+            continue
         if fault > 0.0:
             faces[count, 0], faces[count, 1], faces[count, 2] = a, -1, n_labels
             count += 1
@@ -709,15 +711,6 @@ def _around(dual: Dual, is_near: NDArray) -> NDArray:
             for k in range(dual.cells.shape[1]):
                 is_around[dual.cells[dual.star_cells[r], k]] = True
     return is_around
-
-
-@helper
-def _is_mixed(dual: Dual, labels: NDArray, node: int) -> bool:
-    """Whether cells of two labels meet at a node."""
-    first, is_mixed = dual.star_start[node], False
-    for r in range(first + 1, dual.star_start[node + 1]):
-        is_mixed = is_mixed or labels[dual.star_cells[r]] != labels[dual.star_cells[first]]
-    return is_mixed
 
 
 @helper

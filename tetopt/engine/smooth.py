@@ -235,7 +235,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
     """
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
     n, first, scale = cells.shape[1], stars.start[node], 2.0**-objective.bits
-    every, means = np.empty((2, objective.n_channels)), np.empty((2, min(objective.n_means, objective.n_channels)))
+    every, means = np.empty((2, objective.n_channels)), np.empty((2, objective.n_means))
     for r in range(first, stars.start[node + 1]):
         cell = stars.cells[r]
         for k in range(n):
