@@ -99,7 +99,7 @@ def exchanged(state):
 
 
 def relabelled(state):
-    relabel(state)
+    relabel(state, node_stars(state))
     return state
 
 

@@ -31,13 +31,18 @@ def contact(mesh, of_cell, a, b):
     return 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1).sum()
 
 
+def labels_of(members, index):
+    """Rows of labels at index positions."""
+    return labels_at(members, index, np.arange(len(index))[:, None], np.ones((1, 1)))[:, 0]
+
+
 def test_a_place_has_the_label_of_its_smallest_level():
     """As by interpolation of every label's level; at voxels' centres the partition itself."""
     rng = np.random.default_rng(4)
     members = memberships(tetopt.Image(rng.integers(0, 3, (7, 6, 8)).astype(float)))
     index = rng.uniform(0.0, 1.0, (500, 3)) * (np.array([7, 6, 8]) - 1)
     centres = np.argwhere(members.partition >= 0)
-    assert np.array_equal(labels_at(members, centres.astype(float)), members.partition.ravel())
+    assert np.array_equal(labels_of(members, centres.astype(float)), members.partition.ravel())
     levels = np.array([map_coordinates(members.levels[c], index.T, order=1) for c in members.channel])
     expected = levels.argmin(axis=0)
     # A label is looked for among those of the voxels around; by levels alone another one may be as near.
@@ -48,7 +53,19 @@ def test_a_place_has_the_label_of_its_smallest_level():
         ]
     )
     assert is_near.mean() > 0.95
-    assert np.mean(labels_at(members, index)[is_near] == expected[is_near]) > 0.995  # but ties
+    assert np.mean(labels_of(members, index)[is_near] == expected[is_near]) > 0.995  # but ties
+
+
+@pytest.mark.parametrize("shape", [(9, 8), (7, 6, 8)])
+def test_cells_among_voxels_of_one_label_have_it_everywhere(shape):
+    """Labels at places in cells are those at the same places by themselves, whatever the cells are among."""
+    n, rng = len(shape), np.random.default_rng(6)
+    members = memberships(tetopt.Image((np.indices(shape).sum(axis=0) > 9).astype(float)))
+    corners = rng.uniform(-0.2, 1.0, (200, 1, n)) * shape + rng.uniform(-1.0, 1.0, (200, n + 1, n))
+    cells = np.arange(200 * (n + 1)).reshape(200, n + 1)
+    there = labels_at(members, corners.reshape(-1, n), cells, PART_CENTRES[n])
+    assert np.array_equal(there.ravel(), labels_of(members, (PART_CENTRES[n] @ corners).reshape(-1, n)))
+    assert 10 < (there != there[:, :1]).any(axis=1).sum() < 180
 
 
 def test_small_cells_are_filled_by_levels_not_by_centres():

@@ -18,7 +18,7 @@ from worlds import random_world
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.complex import build, remeasure
+from tetopt.engine.complex import build, node_stars, remeasure
 from tetopt.engine.fast import FAR_TICKS, Run
 from tetopt.engine.interfaces import relabel
 from tetopt.geometry.check import manifold_problems
@@ -69,7 +69,7 @@ def operate(run, rng, made):
         run.attract(float(rng.choice([0.0, 4.0, 12.0])))
         made[kind] += int((run.state.complex.ticks != before).any(axis=1).sum())
     elif kind == "labels" and run.has_labels:
-        made[kind] += relabel(run.state)
+        made[kind] += relabel(run.state, node_stars(run.state))
     run.state = run.state._replace(objective=run.state.objective._replace(geometry=objective.geometry))
 
 

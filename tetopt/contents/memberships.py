@@ -160,46 +160,58 @@ def gathered(
     return Memberships(values, channel, levels, partition, parts)
 
 
-def labels_at(members: Memberships, index: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Rows of the labels whose levels are smallest at index positions (P, n); (P,)."""
+def labels_at(
+    members: Memberships, index: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Rows of the labels whose levels are smallest at barycentric places (S, K) in cells (M, K) of nodes; (M, S).
+
+    Nodes lie at index positions (N, n).
+    """
     shape = (1,) * (3 - index.shape[1]) + members.partition.shape
-    place = np.zeros((len(index), 3))
-    place[:, 3 - index.shape[1] :] = index
-    return np.asarray(
-        _labels_at(
-            members.partition.reshape(shape), members.levels.reshape(-1, *shape), members.channel,
-            np.clip(place, 0.0, np.array(shape) - 1.0),
-        )
-    )  # fmt: skip
+    node = np.zeros((len(index), 3))
+    node[:, 3 - index.shape[1] :] = index
+    row = np.empty((len(cells), len(places)), dtype=np.int64)
+    _fill_labels(
+        row, members.partition.reshape(shape), members.levels.reshape(-1, *shape), members.channel, node, cells, places
+    )
+    return row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _labels_at(partition: NDArray, levels: NDArray, channel: NDArray, index: NDArray) -> NDArray:
-    """The label of the smallest level among those of the voxels around each position."""
-    row, corner, weight = np.empty(len(index), dtype=np.int64), np.empty((8, 3), dtype=np.int64), np.empty(8)
-    for p in range(len(index)):
-        is_same = True
-        for m in range(8):
-            weight[m] = 1.0
+def _fill_labels(
+    row: NDArray, partition: NDArray, levels: NDArray, channel: NDArray, node: NDArray, cells: NDArray, places: NDArray
+) -> None:
+    corner, fraction = np.empty((8, 3), dtype=np.int64), np.empty(3)
+    for cell in range(len(cells)):
+        for s in range(len(places)):
             for d in range(3):
-                low = min(int(index[p, d]), max(partition.shape[d] - 2, 0))
-                fraction = index[p, d] - low
-                is_high = m >> d & 1
-                corner[m, d] = min(low + is_high, partition.shape[d] - 1)
-                weight[m] *= fraction if is_high else 1.0 - fraction
-            is_same &= (
-                partition[corner[m, 0], corner[m, 1], corner[m, 2]]
-                == (partition[corner[0, 0], corner[0, 1], corner[0, 2]])
-            )
-        best, least = partition[corner[0, 0], corner[0, 1], corner[0, 2]], np.inf
-        for m in range(8 * (not is_same)):
-            label, level = partition[corner[m, 0], corner[m, 1], corner[m, 2]], 0.0
-            for q in range(8):
-                level += weight[q] * levels[channel[label], corner[q, 0], corner[q, 1], corner[q, 2]]
-            if level < least or (level == least and label < best):
-                best, least = label, level
-        row[p] = best
-    return row
+                at = 0.0
+                for k in range(cells.shape[1]):
+                    at += places[s, k] * node[cells[cell, k], d]
+                at = min(max(at, 0.0), partition.shape[d] - 1.0)
+                low = min(int(at), max(partition.shape[d] - 2, 0))
+                fraction[d] = at - low
+                for m in range(8):
+                    corner[m, d] = min(low + (m >> d & 1), partition.shape[d] - 1)
+            row[cell, s] = _label_between(partition, levels, channel, corner, fraction)
+
+
+@njit(cache=True, nogil=True)
+def _label_between(partition: NDArray, levels: NDArray, channel: NDArray, corner: NDArray, fraction: NDArray) -> int:
+    """The label of the smallest level among those of the voxels (8, 3) around a place, fractions from the first on."""
+    best, least, is_same = partition[corner[0, 0], corner[0, 1], corner[0, 2]], np.inf, True
+    for m in range(1, 8):
+        is_same = is_same and partition[corner[m, 0], corner[m, 1], corner[m, 2]] == best
+    for m in range(8 * (not is_same)):
+        label, level = partition[corner[m, 0], corner[m, 1], corner[m, 2]], 0.0
+        for q in range(8):
+            weight = 1.0
+            for d in range(3):
+                weight *= fraction[d] if q >> d & 1 else 1.0 - fraction[d]
+            level += weight * levels[channel[label], corner[q, 0], corner[q, 1], corner[q, 2]]
+        if level < least or (level == least and label < best):
+            best, least = label, level
+    return int(best)
 
 
 def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
@@ -272,18 +284,44 @@ def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32]
 
 
 def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    def gaussian(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return scipy.ndimage.gaussian_filter(values, sigma, mode="nearest", truncate=3.0)
+    weights = np.exp(-0.5 / (sigma * sigma) * np.arange(int(3.0 * sigma + 0.5) + 1) ** 2)
+    weights /= np.concatenate([weights[:0:-1], weights]).sum()
+    once = _correlated(level, weights)
+    return once + _correlated(level - once, weights)
 
-    once = gaussian(level)
-    return once + gaussian(level - once)
+
+def _correlated(data: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
+    """`data` weighed along each axis, symmetrically, `weights` (R+1,) from the middle on; constant beyond its faces.
+
+    As by `scipy.ndimage`, to the last bit; but the last axis row by row, in a third of its time.
+    """
+    for axis in range(data.ndim - 1):
+        rows = np.ascontiguousarray(data).reshape(prod(data.shape[:axis]), data.shape[axis], -1)
+        data = _correlated_rows(rows, weights).reshape(data.shape)
+    return np.asarray(scipy.ndimage.correlate1d(data, np.concatenate([weights[:0:-1], weights]), -1, mode="nearest"))
+
+
+@njit(cache=True, nogil=True)
+def _correlated_rows(data: NDArray, weights: NDArray) -> NDArray:
+    """The middle axis of `data` (A, n, B) weighed; sums in float64 and in scipy's order, for all B at once."""
+    result, total = np.empty_like(data), np.empty(data.shape[2])
+    for a in range(data.shape[0]):
+        for i in range(data.shape[1]):
+            here, row = data[a, i], result[a, i]
+            for c in range(len(total)):
+                total[c] = here[c] * weights[0]
+            for j in range(len(weights) - 1, 0, -1):
+                low, high = data[a, max(i - j, 0)], data[a, min(i + j, data.shape[1] - 1)]
+                for c in range(len(total)):
+                    total[c] += (np.float64(low[c]) + np.float64(high[c])) * weights[j]
+            for c in range(len(total)):
+                row[c] = total[c]
+    return result
 
 
 def with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
     """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`."""
-    mean = level  # over each voxel, of the level that is linear between centres
-    for axis in range(level.ndim):
-        mean = scipy.ndimage.correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
+    mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, of the level that is linear between centres
     distance = mean / np.clip(_slope(level), LEAST_SLOPE, 1.0)
     missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0), sigma)
     area = _summed((np.abs(distance) < 0.5).astype(np.float32), sigma)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
-from tetopt.engine.complex import State, copied, interface_energy, node_stars, remeasure, without_cells
+from tetopt.engine.complex import NodeStars, State, copied, interface_energy, node_stars, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import mend_pinches, relabel, with_balance, with_labels
@@ -225,11 +225,13 @@ def followed(
         is_labelled = has_labels and gives_labels(iteration, course)
         if is_labelled:
             run.give_labels()
+        stars = None
         if run.has_labels:
-            run.attract(min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral)
+            degrees = min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral
+            stars = run.attract(degrees)
         # 1. Move the nodes.
         is_early = nodes is not None and iteration <= course.n_early
-        is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION)
+        is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION, stars)
         # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
@@ -338,7 +340,10 @@ class Run:
         objective = self.state.objective
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
-    def sweep(self, is_over: Callable[[], bool] = lambda: False, fraction: float = HOPE_FRACTION) -> bool:
+    def sweep(
+        self, is_over: Callable[[], bool] = lambda: False, fraction: float = HOPE_FRACTION,
+        stars: NodeStars | None = None,
+    ) -> bool:  # fmt: skip
         """Move the nodes that may win something; False if `is_over` cut it short.
 
         A node may win what its last move did, and what has been won around it since then: the mean over its
@@ -347,7 +352,7 @@ class Run:
         """
         gains = np.zeros(len(self.hope))
         is_active = (self.hope > fraction * self.E() / len(gains)) & ~self.is_still
-        is_finished = sweep(self.state, node_stars(self.state), self.groups, is_active, is_over, gains)
+        is_finished = sweep(self.state, stars or node_stars(self.state), self.groups, is_active, is_over, gains)
         around = np.bincount(self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains))
         number = np.bincount(self.cells.ravel(), minlength=len(gains))
         self.hope = np.where(is_active, gains, self.hope) + (around / np.maximum(number, 1) - gains) / self.n
@@ -415,22 +420,25 @@ class Run:
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
 
-    def attract(self, degrees: float) -> None:
+    def attract(self, degrees: float) -> NodeStars:
         """Let cells take other labels where that pays, and bring nodes between labels to where those meet.
 
         No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none below the minimum.
+        Returns the stars, of which no cell changes.
         """
         ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
         self.state = with_balance(self.state, self.content, self.mesh())
-        relabel(self.state)
+        stars = node_stars(self.state)
+        relabel(self.state, stars)
         self._set_band()
         lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:
             lowest = max(lowest, self.state.objective.angle_limit)
-        attract(self.state, node_stars(self.state), self.groups, lowest)
+        attract(self.state, stars, self.groups, lowest)
         is_other = (self.state.complex.ticks != ticks).any(axis=1)[self.cells].any(axis=1)
         is_other |= (self.state.complex.labels != labels)[: self.n_cells]
         self.hope[self.cells[is_other]] = np.inf
+        return stars
 
     def _set_band(self) -> None:
         """Say how far nodes may be off the surface between two labels."""

@@ -8,7 +8,9 @@ leaves both labels' topology as it is.
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -32,11 +34,11 @@ from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.kernels import Floats1, Ints1, entry, helper, unit
+from tetopt.system.kernels import Bools1, Floats1, Ints1, entry, helper, unit
 
 FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
 SAMPLED_FRACTION = 0.5  # of a label's voxels: of one that samples show less of its centres are counted, too
-SAMPLED_AT_ONCE = 100_000  # cells: 50 MB of places
+SAMPLED_AT_ONCE = 20_000  # cells, by each thread
 BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
 SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
 SPARED_LOSS_FRACTION = 0.08  # of a label's volume: to make up for all of it where it is left costs its place, Dice
@@ -141,13 +143,16 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy
     is_counted = owner >= 0
     is_counted[is_counted] = ~is_sampled[owner[is_counted]]
     cell, row, weight = [owner[is_counted]], [members.partition.ravel()[is_counted]], [np.ones(is_counted.sum())]
-    for part in np.array_split(np.flatnonzero(is_sampled), 1 + is_sampled.sum() // SAMPLED_AT_ONCE):
-        inner = PART_CENTRES[image.ndim]
-        corners = mesh.points[mesh.cells[part]]
-        row.append(labels_at(members, image.to_index((inner @ corners).reshape(-1, image.ndim))))
-        cell.append(np.repeat(part, len(inner)))
-        size = np.abs(volumes(mesh.points, mesh.cells[part])) / image.voxel_volume
-        weight.append(np.repeat(size / len(inner), len(inner)))
+    sampled, inner = np.flatnonzero(is_sampled), PART_CENTRES[image.ndim]
+    each = np.abs(volumes(mesh.points, mesh.cells[sampled])) / image.voxel_volume / len(inner)
+    index, parts = image.to_index(mesh.points), np.array_split(mesh.cells[sampled], 1 + len(sampled) // SAMPLED_AT_ONCE)
+    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+        there = np.concatenate(list(threads.map(lambda part: labels_at(members, index, part, inner), parts)))
+    is_one = (there == there[:, :1]).all(axis=1)  # its weights are added up here, one by one, as of the others there
+    cell += [sampled[is_one], np.repeat(sampled[~is_one], len(inner))]
+    row += [there[is_one, 0], there[~is_one].ravel()]
+    whole = np.cumsum(np.broadcast_to(each[is_one, None], (is_one.sum(), len(inner))), axis=1)[:, -1]
+    weight += [whole, np.repeat(each[~is_one], len(inner))]
     # Between the samples a label of a voxel or two is not seen: it has its centres.
     rows = members.partition.ravel()[owner >= 0]
     seen = np.bincount(np.concatenate(row), np.concatenate(weight), shape[1])
@@ -201,14 +206,16 @@ def _meet_everywhere(state: State, stars: NodeStars) -> None:
         _meet(state, stars, node)
 
 
-def relabel(state: State) -> int:
+def relabel(state: State, stars: NodeStars) -> int:
     """Let cells beside an interface take a neighbour's label where E falls and no topology changes; how many did."""
-    stars, total = node_stars(state), 0
-    gain, label = np.zeros(int(state.complex.n_cells[0])), np.zeros(int(state.complex.n_cells[0]), dtype=np.int64)
+    n_cells, total = int(state.complex.n_cells[0]), 0
+    gain, label, is_stale = np.zeros(n_cells), np.zeros(n_cells, dtype=np.int64), np.ones(n_cells, dtype=bool)
     for _ in range(RELABELLING_PASSES):
-        _find_relabellings(gain, label, state)
+        # After the first pass only cells that moved, and those beside them: a sixth of the time of all cells.
+        _find_relabellings(gain, label, state, np.flatnonzero(is_stale))
+        is_stale[:] = False
         order = np.flatnonzero(gain > 0.0)
-        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, state, stars)
+        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, is_stale, state, stars)
         total += moved
         if moved == 0:
             break
@@ -247,21 +254,23 @@ def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) ->
 
 
 @entry
-def _find_relabellings(gain: Floats1, label: Ints1, state: State) -> None:
-    for cell in range(len(gain)):
+def _find_relabellings(gain: Floats1, label: Ints1, state: State, stale: Ints1) -> None:
+    for cell in stale:
         _find_relabelling(gain, label, state, cell)
 
 
 @entry
-def _relabel(order: Ints1, gain: Floats1, label: Ints1, state: State, stars: NodeStars) -> int:
+def _relabel(order: Ints1, gain: Floats1, label: Ints1, is_stale: Bools1, state: State, stars: NodeStars) -> int:
     mesh, moved = state.complex, 0
     for cell in order:
         _find_relabelling(gain, label, state, cell)
         if gain[cell] > 0.0 and keeps_topology(
             mesh.cells, mesh.across, mesh.labels, stars.start, stars.cells, cell, label[cell]
         ):
-            mesh.labels[cell] = label[cell]
+            mesh.labels[cell], is_stale[cell] = label[cell], True
             for k in range(mesh.cells.shape[1]):
                 _meet(state, stars, mesh.cells[cell, k])
+                if mesh.across[cell, k] >= 0:
+                    is_stale[mesh.across[cell, k]] = True
             moved += 1
     return moved

@@ -57,6 +57,7 @@ MOST_SWING = (0.15, 0.4)
 SWING_ROUNDS = 4  # at most, in which they are given again
 MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
+DOUBTFUL_STEPS = 8  # see `_count_steps`
 
 
 class Contacts(NamedTuple):
@@ -619,15 +620,19 @@ class _Work(NamedTuple):
     """Room for the kernels below."""
 
     star: Ints1  # the cells around one node or edge
+    label: Ints1  # the labels that these have, each once
+    own: Ints1  # which of those each of them has
+    beside: Ints2  # where in the star the cells beyond its facets are: its length for the outside, -1 if not around it
     root: Ints1  # of each of them, in the fan that it is in
     place: Ints1  # (M,) where a cell is in the star; -1 in between
-    seen: Ints1  # (N,) the last node of which a node was seen to be a neighbour
+    steps: Ints1  # (N,) between labels, at facets around the edge from one node to another; 0 in between
 
 
 def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
-    place, seen = (np.full(len(array), -1, dtype=np.int64) for array in (dual.cells, dual.scale))
-    return _Work(np.empty(widest, dtype=np.int64), np.empty(widest + 1, dtype=np.int64), place, seen)
+    star, label, own, root = (np.empty(widest + 1, dtype=np.int64) for _ in range(4))
+    beside, place = np.empty((widest, dual.cells.shape[1]), dtype=np.int64), np.full(len(dual.cells), -1)
+    return _Work(star, label, own, beside, root, place, np.zeros(len(dual.scale), dtype=np.int64))
 
 
 def _nonmanifold(
@@ -666,41 +671,65 @@ def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64
     _mend(dual, labels, room, is_bridge, faces[is_two], is_near, _work(dual))
 
 
-@helper
-def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
-    """Whether cells of two labels meet at each node."""
-    is_mixed = np.zeros(len(dual.scale), dtype=np.bool_)
-    for node in range(len(is_mixed)):
-        first, last = dual.star_start[node], dual.star_start[node + 1]
-        for r in range(first + 1, last):
-            if labels[dual.star_cells[r]] != labels[dual.star_cells[first]]:
-                is_mixed[node] = True
-                break
-    return is_mixed
-
-
 @entry
 def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, work: _Work) -> int:
     """The rows of `_nonmanifold` and the number of labels that meet there, (F, 3); their count."""
-    count, is_mixed = 0, _mixed_nodes(dual, labels)
-    for a in range(len(is_mixed)):
-        if not is_mixed[a]:
+    count, is_around = 0, _around(dual, is_near)
+    for a in range(len(is_around)):
+        if not is_around[a]:
             continue
-        fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 1)
+        fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 2)
+        if n_labels == 1:
+            continue
         if fault > 0.0:
             faces[count, 0], faces[count, 1], faces[count, 2] = a, -1, n_labels
             count += 1
-        for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
+        first, last = dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0
+        _count_steps(dual, labels, a, work.steps)
+        for r in range(first, last):
             for k in range(4):
                 b = dual.cells[dual.star_cells[r], k]
-                if b <= a or not is_mixed[b] or work.seen[b] == a or not (is_near[a] or is_near[b]):
+                if b <= a or work.steps[b] < DOUBTFUL_STEPS or not (is_near[a] or is_near[b]):
                     continue
-                work.seen[b] = a
+                work.steps[b] = 0
                 fault, n_labels = _fault(dual, labels, a, b, work)
                 if fault > 0.0:
                     faces[count, 0], faces[count, 1], faces[count, 2] = a, b, n_labels
                     count += 1
+        for r in range(first, last):
+            for k in range(4):
+                work.steps[dual.cells[dual.star_cells[r], k]] = 0
     return count
+
+
+@helper
+def _around(dual: Dual, is_near: NDArray) -> NDArray:
+    """Whether a cell around each node has a node that is near."""
+    is_around = np.zeros(len(is_near), dtype=np.bool_)
+    for node in range(len(is_near)):
+        for r in range(dual.star_start[node], dual.star_start[node + 1] if is_near[node] else 0):
+            for k in range(dual.cells.shape[1]):
+                is_around[dual.cells[dual.star_cells[r], k]] = True
+    return is_around
+
+
+@helper
+def _count_steps(dual: Dual, labels: NDArray, a: int, steps: NDArray) -> None:
+    """Add to `steps` of each node b how many facets around the edge (a, b) lie between labels, from either side.
+
+    A facet outside counts once more, one between labels that are apart as many as are doubtful: with less than
+    `DOUBTFUL_STEPS` labels are one fan each, and need no `_fault`: so that finding faults takes a fifth of the time.
+    """
+    for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
+        cell = dual.star_cells[r]
+        for k in range(4):
+            other = dual.across[cell, k]
+            if dual.cells[cell, k] == a or (other >= 0 and labels[other] == labels[cell]):
+                continue
+            is_apart = other >= 0 and dual.contacts.is_apart[labels[cell], labels[other]]
+            for m in range(4):
+                if m != k:
+                    steps[dual.cells[cell, m]] += DOUBTFUL_STEPS if is_apart else 2 if other < 0 else 1
 
 
 @helper
@@ -715,75 +744,103 @@ def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
 
 
 @unit
-def _excess(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[int, int]:
-    """How many fans too many there are around a node or an edge, over all labels there; and how many these are.
-
-    For each label, the fans of its cells less one and those of all others, the outside among them, less one.
-    """
-    count, is_mixed, star = _gather(dual, a, b, work.star), False, work.star
-    for i in range(1, count):
-        is_mixed = is_mixed or labels[star[i]] != labels[star[0]]
-    if not is_mixed:
-        return 0, 1
-    for i in range(count):
-        work.place[star[i]] = i
-    excess, n_labels = 0, 0
-    for i in range(count):
-        is_new = True
-        for j in range(i):
-            is_new = is_new and labels[star[j]] != labels[star[i]]
-        if is_new:
-            n_labels += 1
-            excess += _fans(dual, labels, a, b, count, labels[star[i]], work) - 2
-    for i in range(count):
-        work.place[star[i]] = -1
-    return excess, n_labels
-
-
-@unit
 def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[float, int]:
     """What is wrong at a node or an edge, in volumes of the cells around it: pinches, and false contact.
 
     The number of labels there comes second; with false contact, which is no matter of manifolds, three or more.
     """
-    excess, n_labels = _excess(dual, labels, a, b, work)
+    count = _gather(dual, a, b, work.star)
+    n_labels = _tell_apart(labels, count, work)
+    if n_labels == 1:
+        return 0.0, 1
+    excess = _excess(dual, labels, a, b, count, n_labels, work)
     fault = (TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT) * excess
-    if n_labels > 1 and _has_false_contact(dual, labels, _gather(dual, a, b, work.star), work.star):
+    if _has_false_contact(dual, count, n_labels, work):
         fault += APART_WEIGHT
         n_labels = n_labels if excess > 0 else max(n_labels, 3)
     return fault, n_labels
 
 
 @helper
-def _has_false_contact(dual: Dual, labels: NDArray, count: int, star: NDArray) -> bool:
+def _tell_apart(labels: NDArray, count: int, work: _Work) -> int:
+    """How many labels the cells of a star have; which, and which of them each cell has, is noted."""
+    n_labels, own = 0, 0
+    for i in range(count):
+        label = labels[work.star[i]]
+        if i == 0 or work.label[own] != label:
+            own = 0
+            while own < n_labels and work.label[own] != label:
+                own += 1
+            if own == n_labels:
+                work.label[own] = label
+                n_labels += 1
+        work.own[i] = own
+    return n_labels
+
+
+@helper
+def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: int, work: _Work) -> int:
+    """How many fans too many there are around a node or an edge, over all labels there.
+
+    For each label, the fans of its cells less one and those of all others, the outside among them, less one.
+    """
+    steps, n_outer = 0, 0
+    for i in range(count if b >= 0 else 0):
+        for k in range(4):
+            if dual.cells[work.star[i], k] != a and dual.cells[work.star[i], k] != b:
+                other = dual.across[work.star[i], k]
+                n_outer += other < 0
+                steps += other >= 0 and labels[other] != labels[work.star[i]]
+    if b >= 0 and n_outer <= 2:  # a ring of cells, or one that the outside closes: each of its arcs is a fan
+        return steps + n_outer - 2 * n_labels
+    is_open, excess = _link(dual, a, b, count, work), 0
+    if n_labels == 2 and not is_open:  # what is not of the one label is of the other
+        return 2 * (_fans(dual, count, 0, is_open, work) - 2)
+    for own in range(n_labels):
+        excess += _fans(dual, count, own, is_open, work) - 2
+    return excess
+
+
+@helper
+def _link(dual: Dual, a: int, b: int, count: int, work: _Work) -> bool:
+    """Note where in a star the cells beyond its facets are; whether one of them is outside."""
+    is_open = False
+    for i in range(count):
+        work.place[work.star[i]] = i
+    for i in range(count):
+        cell = work.star[i]
+        for k in range(dual.cells.shape[1]):
+            other = dual.across[cell, k]
+            is_around = dual.cells[cell, k] != a and dual.cells[cell, k] != b
+            is_open = is_open or (is_around and other < 0)
+            work.beside[i, k] = -1 if not is_around else count if other < 0 else work.place[other]
+    for i in range(count):
+        work.place[work.star[i]] = -1
+    return is_open
+
+
+@helper
+def _has_false_contact(dual: Dual, count: int, n_labels: int, work: _Work) -> bool:
     """Whether labels of some cells meet that the voxels of all these cells keep apart."""
     is_false = False
-    for i in range(1, count):
-        is_new = True
+    for i in range(n_labels):
         for j in range(i):
-            is_new = is_new and labels[star[j]] != labels[star[i]]
-        for j in range(i if is_new else 0):
-            is_false = is_false or dual.contacts.is_apart[labels[star[i]], labels[star[j]]]
+            is_false = is_false or dual.contacts.is_apart[work.label[i], work.label[j]]
     for i in range(count if is_false else 0):
-        is_false = is_false and not dual.contacts.is_place[star[i]]
+        is_false = is_false and not dual.contacts.is_place[work.star[i]]
     return is_false
 
 
 @helper
-def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, work: _Work) -> int:
+def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
     """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
-    root, n_fans, is_open = work.root, count, False  # the last of the roots is the outside's
+    root, n_fans = work.root, count  # the last of the roots is the outside's
     for i in range(count + 1):
         root[i] = i
     for i in range(count):
-        cell = work.star[i]
         for k in range(dual.cells.shape[1]):
-            if dual.cells[cell, k] == a or dual.cells[cell, k] == b:
-                continue
-            other = dual.across[cell, k]
-            j = count if other < 0 else work.place[other]
-            is_open = is_open or other < 0
-            if j < i or (labels[cell] == label) != (j < count and labels[other] == label):
+            j = work.beside[i, k]
+            if j < i or (work.own[i] == own) != (j < count and work.own[j] == own):
                 continue
             p, q = i, j
             while root[p] != p:
@@ -873,12 +930,12 @@ def _best_of_group(
             continue
         if len(faces) == 0:
             faces = _closure(dual, group)
-            before, pinches = _prices(dual, labels, group), _pinches(dual, labels, faces, work)
+            before, pinches = _prices(dual, labels, group), _pinches(dual, labels, faces, 0.0, np.inf, work)
         for cell in group:
             labels[cell] = new
         change = _prices(dual, labels, group) - before - pinches
         if change < least:  # with all pinches gone
-            change += _pinches(dual, labels, faces, work)
+            change += _pinches(dual, labels, faces, change, least, work)
         for cell in group:
             labels[cell] = old
         if change < least:
@@ -925,9 +982,11 @@ def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
 
 
 @unit
-def _pinches(dual: Dual, labels: Ints1, faces: Ints2, work: _Work) -> float:
-    """What these nodes and edges cost that are not manifold."""
+def _pinches(dual: Dual, labels: Ints1, faces: Ints2, others: float, most: float, work: _Work) -> float:
+    """What these nodes and edges cost that are not manifold; or less, where that and the others' are `most` or more."""
     total = 0.0
     for f in range(len(faces)):
         total += _fault(dual, labels, faces[f, 0], faces[f, 1], work)[0] * dual.scale[faces[f, 0]]
+        if others + total >= most:
+            break
     return total

@@ -235,7 +235,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
     """
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
     n, first, scale = cells.shape[1], stars.start[node], 2.0**-objective.bits
-    moment = np.empty((2, objective.n_channels))
+    every, means = np.empty((2, objective.n_channels)), np.empty((2, objective.n_means))
     for r in range(first, stars.start[node + 1]):
         cell = stars.cells[r]
         for k in range(n):
@@ -258,9 +258,10 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
                 elif c == node:
                     b, c = a, b
             normal, area = scaled(float(objective.hand), normal), np.sqrt(dot(normal, normal))
+            moment = means if label_1 == label_2 else every  # cells of one label differ in their means alone
             weight = _facet_moments(moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective)
             jump, rise = 0.0, 0.0
-            for channel in range(objective.n_channels):
+            for channel in range(moment.shape[1]):
                 value_1 = cell_value(sums, cell, label_1, channel, objective)
                 value_2 = cell_value(sums, other, label_2, channel, objective)
                 jump += (value_2 - value_1) * (2.0 * moment[0, channel] - (value_1 + value_2) * weight)

@@ -214,10 +214,12 @@ class Sizes(NamedTuple):
         smallest = np.float32(self.smallest)
         if self.field is None:
             return np.broadcast_to(np.maximum(largest, smallest), image.shape)
-        to_field = np.linalg.inv(self.field.affine) @ image.affine
-        by_place = scipy.ndimage.affine_transform(
-            self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant"
-        )
+        by_place = self.field.data
+        if by_place.shape != image.shape or not np.array_equal(self.field.affine, image.affine):
+            to_field = np.linalg.inv(self.field.affine) @ image.affine
+            by_place = scipy.ndimage.affine_transform(
+                by_place, to_field, output_shape=image.shape, order=0, mode="grid-constant"
+            )
         return np.asarray(np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest))
 
     def at(self, points: NDArray) -> NDArray[np.float64]:
@@ -329,16 +331,19 @@ def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] |
     n = image.ndim
     is_in = target < NO_BOUND_MM if inside is None else inside & (target < NO_BOUND_MM)
     edge = np.where(is_in, target, np.inf).astype(np.float64)
-    nodes = EQUILATERAL_NODES[n] * image.voxel_volume * float((edge**-n).sum())
+    # Powers only where they are not 0, and below of steps alone: a fifth of the time of all.
+    density = np.power(edge, -n, where=is_in, out=np.zeros(edge.shape))
+    nodes = EQUILATERAL_NODES[n] * image.voxel_volume * float(density.sum())
     of_facet = 0.5 * (EQUILATERAL_NODES[2] if n == 3 else 1.0)
     across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)  # of a voxel's volume, to its sides' areas
     for axis in range(n):
-        area = image.voxel_volume * float(across[axis])
-        of_voxel = np.moveaxis(of_facet * area * edge ** (1 - n), axis, 0)
-        nodes += float(of_voxel[0].sum() + of_voxel[-1].sum())
+        area = of_facet * (image.voxel_volume * float(across[axis]))
+        along = np.moveaxis(edge, axis, 0)
+        nodes += float((area * along[0] ** (1 - n)).sum() + (area * along[-1] ** (1 - n)).sum())
         if inside is not None:
             whole = np.moveaxis(inside, axis, 0)
-            steps = of_voxel[1:][whole[1:] & ~whole[:-1]].sum() + of_voxel[:-1][whole[:-1] & ~whole[1:]].sum()
+            up, down = along[1:][whole[1:] & ~whole[:-1]], along[:-1][whole[:-1] & ~whole[1:]]
+            steps = (area * up ** (1 - n)).sum() + (area * down ** (1 - n)).sum()
             nodes += STAIRCASE_RATIO[n] * float(steps)
     return nodes
 
