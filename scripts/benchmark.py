@@ -16,11 +16,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import tetopt
 from tetopt.io.mni import mni_path, mni_tissue
@@ -95,10 +96,14 @@ def first_calls(nodes: int) -> dict[str, dict[str, float]]:
     return rows
 
 
-def process_seconds(command: Sequence[str], environment: dict[str, str] | None = None) -> tuple[float, float]:
-    """Wall and CPU seconds of a process and of those that it starts."""
+def process_seconds(
+    command: Sequence[str], environment: dict[str, str] | None = None, allowed: Sequence[int] = (0,)
+) -> tuple[float, float]:
+    """Wall and CPU seconds of a process and of those that it starts, which ends with one of the allowed codes."""
     before, begin = os.times(), time.perf_counter()
-    subprocess.run(command, env=environment, check=True, capture_output=True)
+    done = subprocess.run(command, env=environment, capture_output=True)
+    if done.returncode not in allowed:
+        done.check_returncode()
     wall, after = time.perf_counter() - begin, os.times()
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
     return wall, cpu
@@ -126,7 +131,7 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
         if cgal is None:
             rows["cgal"] = "no program named (--cgal)"
         else:
-            commands["cgal"], rows["cgal_nodes"] = _cgal_command([cgal], labels, None, nodes, folder)
+            commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
         seconds: dict[str, list[tuple[float, float]]] = {}
         for _ in range(turns):
             for name, command in commands.items():
@@ -140,34 +145,34 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
     return rows
 
 
-def _cgal_command(
-    program: list[str], labels: tetopt.Image, sizes: tetopt.Image | None, nodes: int, folder: Path
-) -> tuple[list[str], int]:
-    """The command that gives about so many nodes, and how many those are; at most six runs to find it.
+def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
+    """`_sized` of the program that takes one size."""
+    # Label 0 is left out by CGAL: all are raised by one. Padded by a voxel, so that the outer ones are meshed whole.
+    raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")
+    grid = _written(folder / "labels.raw", raised, labels)
 
-    The size is one number, or the sizes by place, mm, times one.
-    """
-    # Label 0 is left out by CGAL: all are raised by one where it is meshed, too. Padded by a voxel, so that the outer
-    # ones are meshed whole.
-    data = labels.data.astype(np.uint8) + np.uint8(sizes is None)
-    raised = np.pad(data, 1, mode="edge" if sizes is None else "constant")
-    raised.transpose(2, 1, 0).tofile(folder / "labels.raw")
-    spacing = np.sqrt((labels.affine[:3, :3] ** 2).sum(axis=0))
-    size = 1.8 * (labels.volume / nodes) ** (1 / 3) if sizes is None else 3.0
+    def command(size: float) -> list[str]:
+        return [program, str(folder / "labels.raw"), *grid, str(folder / "mesh.bin"), str(size)]
+
+    return _sized(command, 1.8 * (labels.volume / nodes) ** (1 / 3), nodes)
+
+
+def _written(path: Path, padded: NDArray, image: tetopt.Image) -> list[str]:
+    """The words by which CGAL's programs are told the grid of voxels, which are written as they read them."""
+    padded.transpose(2, 1, 0).tofile(path)
+    return [*map(str, padded.shape), *map(str, image.spacing)]
+
+
+def _sized(command: Callable[[float], list[str]], size: float, nodes: int) -> tuple[list[str], int]:
+    """The command of the size that gives about so many nodes, and how many those are; at most six runs to find it."""
     for _ in range(6):
-        numbers = [*map(str, raised.shape), *map(str, spacing), str(folder / "mesh.bin")]
-        if sizes is None:
-            command = [*program, str(folder / "labels.raw"), *numbers, str(size)]
-        else:
-            field = np.pad(size * sizes.data, 1, mode="edge").astype(np.float32)
-            field.transpose(2, 1, 0).tofile(folder / "sizes.raw")
-            command = [*program, str(folder / "labels.raw"), str(folder / "sizes.raw"), *numbers, "1"]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        words = command(size)
+        done = subprocess.run(words, check=True, capture_output=True, text=True)
         n_nodes = int(json.loads(done.stdout)["nodes"])
         if abs(n_nodes / nodes - 1.0) < 0.03:
             break
         size *= (n_nodes / nodes) ** (1 / 2.2)
-    return command, n_nodes
+    return words, n_nodes
 
 
 def labelled(path: Path, nodes: int) -> dict[str, Any]:
@@ -202,8 +207,7 @@ def masked_start(path: Path, nodes: int) -> dict[str, Any]:
         mask = Path(name) / "mask.nii.gz"
         tissues = _tissues(path)
         tetopt.save_image(mask, tetopt.Image(1.0 * (tissues.data > 0), tissues.affine))
-        command = [sys.executable, "-c", program, str(path), str(mask), str(nodes)]
-        return json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+        return _told_by(program, path, mask, nodes)
 
 
 def stopped(seconds: float) -> dict[str, float]:
@@ -235,15 +239,23 @@ def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
         out = folder / "out.vtu"
         command = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(out), "--labels", str(path)]
         command += ["--background", "0", "--size-min", "1", "--nodes", str(nodes), "--label-size", words]
-        wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"])
-        rows = {"nodes": nodes, "cells": len(tetopt.read_mesh(out).cells), "wall": wall, "cpu": cpu}
-        rows["peak_gb"] = json.loads((folder / "run.json").read_text())["memory"]["peak_bytes"] / 1e9
+        # A mesh that violates a requirement, exit code 1, is timed like any other, and the row says which.
+        wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"], allowed=(0, 1))
+        run = json.loads((folder / "run.json").read_text())
+        rows = {"nodes": nodes, "cells": len(tetopt.load_mesh(out).mesh.cells), "wall": wall, "cpu": cpu}
+        rows |= {"peak_gb": run["memory"]["peak_bytes"] / 1e9, "violated": [*run["violated"]]}
         if cgal is not None:
-            by_label = parse_label_sizes(words)
-            made = tetopt.sizes_by_label(tetopt.Sizes(smallest=1.0, by_label=by_label), tetopt.content(image, image))
-            sizes = tetopt.Image(made.sizes.on_voxels(image), image.affine)
-            program, rows["cgal_nodes"] = _cgal_command([cgal], image, sizes, nodes, folder)
-            rows["cgal"] = dict(zip(("wall", "cpu"), process_seconds(program), strict=True))
+            asked = tetopt.Sizes(smallest=1.0, by_label=parse_label_sizes(words))
+            field = tetopt.sizes_by_label(asked, tetopt.content(image, image)).sizes.on_voxels(image)
+            grid = _written(folder / "labels.raw", np.pad(image.data.astype(np.uint8), 1), image)
+
+            def sized(factor: float) -> list[str]:
+                _written(folder / "sizes.raw", np.pad(factor * field, 1, mode="edge").astype(np.float32), image)
+                raw = str(folder / "labels.raw"), str(folder / "sizes.raw")
+                return [cgal, *raw, *grid, str(folder / "mesh.bin"), "1"]
+
+            command, rows["cgal_nodes"] = _sized(sized, 1.0, nodes)
+            rows["cgal"] = dict(zip(("wall", "cpu"), process_seconds(command), strict=True))
             rows["over_cgal"] = {clock: rows[clock] / rows["cgal"][clock] for clock in ("wall", "cpu")}
     return rows
 
@@ -278,9 +290,13 @@ def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
         "    'E_D_fraction': tetopt.E_D(image, mesh) / variance,\n"
         "    'peak_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}))\n"
     )
-    command = [sys.executable, "-c", program, str(path), str(nodes), str(edge)]
-    done = subprocess.run(command, check=True, capture_output=True)
-    return json.loads(done.stdout.splitlines()[-1])
+    return _told_by(program, path, nodes, edge)
+
+
+def _told_by(program: str, *words: object) -> dict[str, Any]:
+    """The JSON in the last line that a program prints, in a process of its own."""
+    command = [sys.executable, "-c", program, *map(str, words)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True).stdout.splitlines()[-1])
 
 
 def show(rows: dict[str, Any]) -> None:
