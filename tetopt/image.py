@@ -306,7 +306,7 @@ class Image:
         return _boxes(shape, n_planes, min(n_rows // step * step or n_rows, s1))
 
     def __repr__(self) -> str:
-        values = "stored" if self.is_stored else f"{self.data.min():.4g} to {self.data.max():.4g}"
+        values = "stored" if self.is_stored else f"{self.range[0]:.4g} to {self.range[1]:.4g}"
         return f"Image({self._size()}, {self.voxels.dtype}, {values})"
 
     def _size(self) -> str:
@@ -319,8 +319,7 @@ class Image:
         rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
         if self.is_stored:
             return notebook.card_html("Image", rows, "")
-        low, high, mean = self.data.min(), self.data.max(), self.data.mean(dtype=np.float64)
-        rows.insert(1, ("intensities", f"{low:.4g} to {high:.4g}, mean {mean:.4g}"))
+        rows.insert(1, ("intensities", f"{self.range[0]:.4g} to {self.range[1]:.4g}, mean {self.mean:.4g}"))
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 

@@ -202,7 +202,7 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
         return Image(is_inside, image.affine)
     if level is None:
         raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
-    low, high = float(image.data.min()), float(image.data.max())
+    low, high = image.range
     outcome = "every voxel is foreground" if fraction > 0.5 else "nothing is left"
     raise InputError(
         f"`background` {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "

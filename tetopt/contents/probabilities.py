@@ -68,8 +68,8 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     >>> tetopt.resample_tissue(ball, image).shape
     (16, 16, 16)
     """
-    low, high = float(tissue.data.min()), float(tissue.data.max())
-    if PERCENT < high <= BYTE_SCALE and low >= 0.0 and (np.rint(tissue.data) == tissue.data).all():
+    low, high = tissue.range
+    if PERCENT < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
         warn(f"{name}: whole numbers to {high:g}, taken as probabilities times 255")
         tissue = Image(tissue.data / BYTE_SCALE, tissue.affine)
     _check_range(name, tissue)
@@ -169,7 +169,7 @@ def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Me
 
 
 def _check_range(name: str, tissue: Image) -> None:
-    low, high = float(tissue.data.min()), float(tissue.data.max())
+    low, high = tissue.range
     if low < -RANGE_TOLERANCE or high > 1.0 + RANGE_TOLERANCE:
         raise InputError(
             f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; divide by the value that stands for "

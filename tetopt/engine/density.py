@@ -64,6 +64,7 @@ from tetopt.engine.smooth import (
     trial_of,
 )
 from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, star_faces_up, uphill_at
+from tetopt.geometry.topology import compact
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
@@ -203,10 +204,7 @@ def compacted(
     is_dirty = np.zeros(n_cells, dtype=np.bool_) if is_dirty is None else is_dirty
     n_before = len(state.complex.ticks) if n_before is None else n_before
     cells = state.complex.cells[:n_cells]
-    is_used = np.zeros(n_before + n_split, dtype=bool)
-    is_used[cells] = True
-    cells[:] = (np.cumsum(is_used) - 1)[cells]
-    kept = np.flatnonzero(is_used)
+    kept, cells[:] = compact(cells, n_before + n_split)
     is_touched = np.zeros(len(kept), dtype=bool)
     is_touched[cells[is_dirty[:n_cells]]] = True
     old = state.complex

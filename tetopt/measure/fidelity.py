@@ -354,7 +354,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     >>> print(f"Dice {fidelity.dice:.2f}, {fidelity.distance_mean:.2f} voxels off")
     Dice 1.00, 0.12 voxels off
     """
-    low, high = float(mask.data.min()), float(mask.data.max())
+    low, high = mask.range
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
     is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_FRACTION

@@ -498,11 +498,11 @@ def _division(
     # A finer block may hold the largest error: noise is taken off the coarser ones, too.
     above = [at_depth.error[at_depth.error > 0.0] for at_depth in blocks[:-1]]
     ends = [(float(errors.min()), float(errors.max())) for errors in above if len(errors)]
-    low, high = (0.5 * min(ends)[0], 2.0 * max(high for _, high in ends)) if ends else (0.5, 1.0)
+    low, high = (0.5 * min(ends)[0], 2.0 * max(high for _, high in ends)) if ends else (1.0, 1.0)
     del above
     regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
     best_count, best, is_bound = -1, [], False
-    for _ in range(BISECTION_STEPS if ends else 1):  # whatever the threshold, where no block may be divided
+    for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
         # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number

@@ -126,9 +126,9 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
         raise NotInstalled(f"itk-cleaver: not installed; {INSTALL_HINT}")
     if image.ndim != 3 or labels.shape != image.shape:
         raise InputError(f"labels: expected 3 axes and the image's shape {image.shape}, got {labels.shape}")
-    if not np.array_equal(np.rint(labels.data), labels.data):
+    if not labels.is_whole:
         raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
-    if labels.data.min() == labels.data.max():
+    if labels.range[0] == labels.range[1]:
         raise InputError("labels: expected two or more, got one; there is no interface to mesh")
     if nodes < 8:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")

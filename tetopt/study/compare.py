@@ -337,9 +337,7 @@ def _run(
         sweep += tradeoff(image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of))
     report = Report(
         command=comparison.command,
-        image=records.ImageFacts(
-            comparison.image_source, image.shape, image.spacing.tolist(), float(np.var(image.data, dtype=np.float64))
-        ),
+        image=records.ImageFacts(comparison.image_source, image.shape, image.spacing.tolist(), image.variance),
         labels=comparison.label_source,
         mapping=comparison.mapping_words,
         versions=versions() | _peers() | _programs(settings),

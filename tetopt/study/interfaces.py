@@ -109,7 +109,7 @@ def _check(image: Image, size: float, labels: Image | None) -> None:
         return
     if labels.shape != image.shape:
         raise InputError(f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample them")
-    if not np.array_equal(np.rint(labels.data), labels.data):
+    if not labels.is_whole:
         raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
 
 

@@ -75,7 +75,7 @@ def reproduce(
     labels_name = None if labels_path is None else labels_path.name
     if image_path is None and labels_path is None:
         tissue, labels_name = mni_tissue(), "MNI152 tissue"
-    if min(volume.shape) < 16 or volume.data.min() == volume.data.max():
+    if min(volume.shape) < 16 or volume.range[0] == volume.range[1]:
         raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
     if tissue is None:
         note("no `labels`: the section on approximate segmentation is left out")
