@@ -9,8 +9,8 @@ from test_labelling import across_of, lattice
 import tetopt
 from tetopt.contents.content import BAND_FRACTION
 from tetopt.contents.memberships import labels_at, memberships
-from tetopt.engine.interfaces import PART_CENTRES, cell_contents
-from tetopt.engine.labelling import MOST_SWING, balanced, contacts_of, labelled
+from tetopt.engine.interfaces import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
+from tetopt.engine.labelling import MOST_SWING, balanced, label_voxels, labelled
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.interfaces import label_interfaces
 
@@ -73,13 +73,39 @@ def test_small_cells_are_filled_by_levels_not_by_centres():
     image = tetopt.Image((np.indices((8, 8, 8))[0] >= 4).astype(float) + 1.0)
     mesh = tetopt.lattice_mesh(image, spacing=1.6)
     members = memberships(image)
-    counts, _ = cell_contents(image, members, mesh)
+    counts, _ = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2))
     size = volumes(mesh.points, mesh.cells)
     assert counts.sum(axis=1) == pytest.approx(size)
     places = PART_CENTRES[3] @ mesh.points[mesh.cells]
     above = (places[:, :, 0] > 3.5).mean(axis=1)  # index -0.5 is the side of the box
     assert counts.toarray()[:, 1] == pytest.approx(above * size)
     assert ((above > 0.0) & (above < 1.0)).any()
+
+
+@pytest.mark.parametrize("spacing", [1.7, 5.5])
+def test_contents_of_cells_are_those_of_a_plain_count(spacing):
+    """Cells with many centres hold those; others samples, and centres of a label that samples hardly show."""
+    data = np.random.default_rng(3).integers(1, 4, (12, 13, 14)).astype(float)
+    data[:6], data[8, 8, 8] = 1.0, 4.0
+    image = tetopt.Image(data)
+    mesh, members = tetopt.lattice_mesh(image, spacing=spacing), memberships(image)
+    voxels = label_voxels(members.partition, image.spacing, 4)
+    counts, contacts = cell_contents(image, members, mesh, voxels)
+    owner, aim = tetopt.cell_of_voxel(image, mesh), np.zeros(counts.shape)
+    is_few = np.bincount(owner.ravel(), minlength=len(aim)) < FEWEST_CENTRES
+    there = labels_at(members, image.to_index(mesh.points), mesh.cells, PART_CENTRES[3])
+    share = volumes(mesh.points, mesh.cells) / len(PART_CENTRES[3])
+    for cell in range(len(aim)):
+        for label in there[cell] if is_few[cell] else members.partition[owner == cell]:
+            aim[cell, label] += share[cell] if is_few[cell] else 1.0
+    seen = aim.sum(axis=0)
+    for place, label in np.ndenumerate(members.partition):
+        if seen[label] < SAMPLED_FRACTION * (members.partition == label).sum() and is_few[owner[place]]:
+            aim[owner[place], label] += 1.0
+    assert 0 < is_few.sum() and is_few.all() == (spacing < 2.0)
+    assert counts.has_sorted_indices
+    assert counts.toarray() == pytest.approx(aim, abs=1e-12)
+    assert contacts.is_place.sum() == len(np.unique(owner.ravel()[voxels.places]))
 
 
 def slab(n, cubes):
@@ -127,14 +153,14 @@ def test_pairs_that_do_not_touch():
     """Two labels beside a third, and one place where they touch."""
     partition = np.zeros((8, 6, 6), dtype=np.int64)
     partition[3:5], partition[5:] = 1, 2
-    owner = np.arange(partition.size).reshape(partition.shape)
-    contacts = contacts_of(partition, np.ones(3), 3, owner, partition.size)
-    assert contacts.is_apart.tolist() == [[False, False, True], [False, False, False], [True, False, False]]
-    assert not contacts.is_place.any()
+    voxels = label_voxels(partition, np.ones(3), 3)
+    assert voxels.is_apart.tolist() == [[False, False, True], [False, False, False], [True, False, False]]
+    assert len(voxels.places) == 0
     partition[3:5, 2, 2] = 2
-    contacts = contacts_of(partition, np.ones(3), 3, owner, partition.size)
-    assert contacts.is_apart[0, 2]
-    assert sorted(np.flatnonzero(contacts.is_place)) == sorted([owner[2, 2, 2], owner[3, 2, 2]])
+    voxels = label_voxels(partition, np.ones(3), 3)
+    assert voxels.is_apart[0, 2]
+    number = np.arange(partition.size).reshape(partition.shape)
+    assert voxels.places.tolist() == [number[2, 2, 2], number[3, 2, 2]]
 
 
 @pytest.mark.full

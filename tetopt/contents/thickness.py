@@ -134,7 +134,7 @@ def _thickness(
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
     _over_slabs(lambda slab: _fill_chords(chord, is_middle, labels, (*rays, edges), most, slab), whole, n)
     thickness = chord.copy()
-    _spread_balls(thickness, chord, is_middle, labels.partition, edges)
+    _over_slabs(lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab), whole, n)
     return thickness.reshape(partition.shape)
 
 
@@ -251,22 +251,24 @@ def _cosine(
     return max(abs(along) / (length * np.sqrt(square)), LEAST_COSINE) if square > 0.0 else 1.0
 
 
-@njit(cache=True, error_model="numpy")
-def _spread_balls(thickness: NDArray, chord: NDArray, is_middle: NDArray, partition: NDArray, edges: NDArray) -> None:
-    """Raise each voxel's thickness to the diameter of the largest ball around a middle that covers it."""
-    s0, s1, s2 = partition.shape
-    for i in range(s0):
-        for j in range(s1):
-            for k in range(s2):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spread_balls(
+    thickness: NDArray, chord: NDArray, is_middle: NDArray, partition: NDArray, edges: NDArray,
+    slab: tuple[tuple[int, int], ...],
+) -> None:  # fmt: skip
+    """Raise the thickness of each voxel of a slab to the diameter of the largest ball around a middle that covers it."""
+    for i in range(partition.shape[0]):
+        for j in range(partition.shape[1]):
+            for k in range(partition.shape[2]):
                 if not is_middle[i, j, k]:
                     continue
                 size, r = chord[i, j, k], 0.5 * chord[i, j, k]
                 r0, r1, r2 = int(r / edges[0]), int(r / edges[1]), int(r / edges[2])
-                for a in range(max(i - r0, 0), min(i + r0 + 1, s0)):
+                for a in range(max(i - r0, slab[0][0]), min(i + r0 + 1, slab[0][1])):
                     x = 0.0 if a == i else ((a - i) * edges[0]) ** 2
-                    for b in range(max(j - r1, 0), min(j + r1 + 1, s1)):
+                    for b in range(max(j - r1, slab[1][0]), min(j + r1 + 1, slab[1][1])):
                         y = x + ((b - j) * edges[1]) ** 2
-                        for c in range(max(k - r2, 0), min(k + r2 + 1, s2)):
+                        for c in range(max(k - r2, slab[2][0]), min(k + r2 + 1, slab[2][1])):
                             is_same = partition[a, b, c] == partition[i, j, k]
                             is_in = y + ((c - k) * edges[2]) ** 2 <= r * r
                             if is_same and is_in and thickness[a, b, c] < size:

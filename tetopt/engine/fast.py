@@ -24,7 +24,7 @@ from tetopt.engine.complex import NodeStars, State, copied, interface_energy, no
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import mend_pinches, relabel, with_balance, with_labels
-from tetopt.engine.labelling import voxel_components
+from tetopt.engine.labelling import LabelVoxels, label_voxels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
     SHAPE_POWER,
@@ -317,7 +317,7 @@ class Run:
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
-        self.components: list[NDArray] = []  # voxels in those of each label, once they are needed
+        self.label_voxels: LabelVoxels | None = None  # once they are needed
         # Its variance, estimated when it is first needed.
         self.image_noise: float | None = None if whole is None else whole.noise
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
@@ -413,9 +413,9 @@ class Run:
         if self.content.smooth is None:
             return
         members = self.content.smooth.memberships
-        if not self.components:
-            self.components = voxel_components(members.partition, len(members.labels))
-        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.components)
+        if self.label_voxels is None:
+            self.label_voxels = label_voxels(members.partition, self.image.spacing, len(members.labels))
+        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.label_voxels)
         self.has_labels = True
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
@@ -504,8 +504,8 @@ class Run:
                     n_gone += self._take_out(is_flat)
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
             n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
-        if self.has_labels and self.content.memberships is not None:
-            mend_pinches(self.state, self.image, self.content.memberships, self.mesh())
+        if self.label_voxels is not None and self.content.memberships is not None:
+            mend_pinches(self.state, self.image, self.content.memberships, self.mesh(), self.label_voxels)
         return n_gone
 
     @property

@@ -21,12 +21,12 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
 from tetopt.engine.labelling import (
     Contacts,
+    LabelVoxels,
     balanced,
-    contacts_of,
     keeps_topology,
+    label_voxels,
     labelled,
     unpinched,
-    voxel_components,
 )
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
@@ -34,6 +34,7 @@ from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import Bools1, Floats1, Ints1, entry, helper, unit
 
 FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
@@ -49,23 +50,23 @@ LEAST_RELABELLING_FRACTION = 1e-9  # of the energies weighed: a smaller gain may
 
 
 def with_labels(
-    state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, components: list[NDArray] | None = None
+    state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, voxels: LabelVoxels | None = None
 ) -> State:
     """The state with a label for each cell, of the content's, and an objective that counts what is not of it.
 
-    `components` are those of the labels' voxels (`voxel_components`), if they are known. Labels that cells have already
+    `voxels` is what the labels' voxels say of any mesh (`label_voxels`), if it is known. Labels that cells have already
     say what volume each label has lost or won, and its bias is brought up to date.
     """
     members, tension, own_channel, own_value, keeps_volumes, _ = smooth
     bias = None if keeps_volumes else np.zeros(len(members.labels))
-    components = components or voxel_components(members.partition, len(members.labels))
+    voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels))
     if len(state.objective.bias) > 0:
         state = with_balance(state, content, mesh)
         bias = state.objective.bias
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
-    counts, contacts = cell_contents(image, members, mesh)
-    made = labelled(mesh.points, mesh.cells, across, counts, components, contacts, bias)
+    counts, contacts = cell_contents(image, members, mesh, voxels)
+    made = labelled(mesh.points, mesh.cells, across, counts, voxels.components, contacts, bias)
     state.complex.labels[:n_cells] = made.labels
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
@@ -120,48 +121,105 @@ def _shifted(
     return np.asarray(np.clip(shift + way, -most, most))
 
 
-def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh) -> None:
+def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> None:
     """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
-        labels[:] = unpinched(mesh.points, mesh.cells, across, *cell_contents(image, members, mesh), labels)
+        counts, contacts = cell_contents(image, members, mesh, voxels)
+        labels[:] = unpinched(mesh.points, mesh.cells, across, counts, contacts, labels)
         _meet_everywhere(state, node_stars(state))
 
 
-def cell_contents(image: Image, members: Memberships, mesh: Mesh) -> tuple[scipy.sparse.csr_array, Contacts]:
+def cell_contents(
+    image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels
+) -> tuple[scipy.sparse.csr_array, Contacts]:
     """Voxels of each label in each cell, (M, K), and where labels touch; by samples where a cell holds few centres.
 
     A cell of a thin sheet may hold one centre, or none. What is sampled are the levels, at the centres of equal parts.
     """
-    shape = len(mesh.cells), len(members.labels)
-    owner = cell_of_voxel(image, mesh)
-    contacts = contacts_of(members.partition, image.spacing, shape[1], owner, shape[0])
-    owner = owner.ravel()
-    n_owned = np.bincount(owner[owner >= 0], minlength=shape[0])
+    n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
+    owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
+    n_owned, n_of = np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
+    _count_centres(n_owned, n_of, owner, partition)
     is_sampled = n_owned < FEWEST_CENTRES
-    is_counted = owner >= 0
-    is_counted[is_counted] = ~is_sampled[owner[is_counted]]
-    cell, row, weight = [owner[is_counted]], [members.partition.ravel()[is_counted]], [np.ones(is_counted.sum())]
-    sampled, inner = np.flatnonzero(is_sampled), PART_CENTRES[image.ndim]
-    each = np.abs(volumes(mesh.points, mesh.cells[sampled])) / image.voxel_volume / len(inner)
-    index, parts = image.to_index(mesh.points), np.array_split(mesh.cells[sampled], 1 + len(sampled) // SAMPLED_AT_ONCE)
+    start = np.append(0, np.cumsum(np.where(is_sampled, len(inner), n_owned)))
+    found = np.empty(start[-1], dtype=np.int32)
+    _place_centres(found, start[:-1].copy(), owner, partition, is_sampled)
+    sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
+    parts = np.array_split(sampled, 1 + len(sampled) // SAMPLED_AT_ONCE)
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        there = np.concatenate(list(threads.map(lambda part: labels_at(members, index, part, inner), parts)))
-    is_one = (there == there[:, :1]).all(axis=1)  # its weights are added up here, one by one, as of the others there
-    cell += [sampled[is_one], np.repeat(sampled[~is_one], len(inner))]
-    row += [there[is_one, 0], there[~is_one].ravel()]
-    whole = np.cumsum(np.broadcast_to(each[is_one, None], (is_one.sum(), len(inner))), axis=1)[:, -1]
-    weight += [whole, np.repeat(each[~is_one], len(inner))]
+        rows = threads.map(lambda part: labels_at(members, index, mesh.cells[part], inner), parts)
+        for part, there in zip(parts, rows, strict=True):
+            found[start[part, None] + np.arange(len(inner))] = there
+    each = np.where(is_sampled, np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / len(inner), 1.0)
+    first = np.zeros(n_cells + 1, dtype=np.int64)
+    _count_kinds(first, found, start, n_labels)
+    np.cumsum(first, out=first)
+    row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
+    _sum_kinds(row, volume, first, found, start, each, n_labels)
+    counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
     # Between the samples a label of a voxel or two is not seen: it has its centres.
-    rows = members.partition.ravel()[owner >= 0]
-    seen = np.bincount(np.concatenate(row), np.concatenate(weight), shape[1])
-    is_unseen = (owner >= 0) & ~is_counted
-    is_unseen &= (seen < SAMPLED_FRACTION * np.bincount(rows, minlength=shape[1]))[members.partition.ravel()]
-    cell, row = [*cell, owner[is_unseen]], [*row, members.partition.ravel()[is_unseen]]
-    weight.append(np.ones(is_unseen.sum()))
-    every = np.concatenate(weight), (np.concatenate(cell), np.concatenate(row))
-    return scipy.sparse.csr_array(every, shape=shape), contacts
+    is_unseen = np.bincount(row, volume, n_labels) < SAMPLED_FRACTION * n_of
+    if is_unseen.any():
+        centre = np.flatnonzero(is_unseen[partition] & (owner >= 0))
+        centre = centre[is_sampled[owner[centre]]]
+        at = owner[centre], partition[centre]
+        counts = counts + scipy.sparse.csr_array((np.ones(len(centre)), at), shape=counts.shape)
+    is_place = np.zeros(n_cells + 1, dtype=bool)
+    is_place[owner[voxels.places]] = True
+    return counts, Contacts(voxels.is_apart, is_place[:-1].copy())
+
+
+@njit(cache=True, nogil=True)
+def _count_centres(n_owned: NDArray, n_of: NDArray, owner: NDArray, partition: NDArray) -> None:
+    """Count the voxel centres in each cell, and those of each label in any of them."""
+    for v in range(len(owner)):
+        if owner[v] >= 0:
+            n_owned[owner[v]] += 1
+            n_of[partition[v]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _place_centres(found: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray) -> None:
+    for v in range(len(owner)):
+        cell = owner[v]
+        if cell >= 0 and not is_sampled[cell]:
+            found[end[cell]] = partition[v]
+            end[cell] += 1
+
+
+@njit(cache=True, nogil=True)
+def _count_kinds(first: NDArray, found: NDArray, start: NDArray, n_labels: int) -> None:
+    """Count the labels that each cell has any of."""
+    last = np.full(n_labels, -1, dtype=np.int64)
+    for cell in range(len(start) - 1):
+        for i in range(start[cell], start[cell + 1]):
+            if last[found[i]] != cell:
+                last[found[i]] = cell
+                first[cell + 1] += 1
+
+
+@njit(cache=True, nogil=True)
+def _sum_kinds(
+    row: NDArray, volume: NDArray, first: NDArray, found: NDArray, start: NDArray, each: NDArray, n_labels: int
+) -> None:
+    total = np.zeros(n_labels)
+    for cell in range(len(start) - 1):
+        end = first[cell]
+        for i in range(start[cell], start[cell + 1]):
+            label = found[i]
+            if total[label] == 0.0:
+                m = end
+                while m > first[cell] and row[m - 1] > label:  # in rising order
+                    row[m] = row[m - 1]
+                    m -= 1
+                row[m] = label
+                end += 1
+            total[label] += each[cell]
+        for m in range(first[cell], end):
+            volume[m] = total[row[m]]
+            total[row[m]] = 0.0
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:

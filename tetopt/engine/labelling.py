@@ -61,10 +61,18 @@ DOUBTFUL_STEPS = 8  # see `_count_steps`
 
 
 class Contacts(NamedTuple):
-    """Which labels touch in the voxels; made by `contacts_of`."""
+    """Which labels touch in the voxels."""
 
     is_apart: Bools2  # (K, K) pairs that do not touch, or at few places alone
     is_place: Bools1  # (M,) cells that have a voxel at such a place
+
+
+class LabelVoxels(NamedTuple):
+    """What the voxels of labels say of any mesh; made by `label_voxels`."""
+
+    components: list[NDArray[np.int64]]  # voxels in each component of each label, falling
+    is_apart: NDArray[np.bool_]  # (K, K) as of `Contacts`
+    places: NDArray[np.int64]  # voxels, as numbers of the flat grid, beside one of a label that is apart from theirs
 
 
 class Labelling(NamedTuple):
@@ -248,30 +256,23 @@ def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArra
     return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
 
 
-def contacts_of(
-    partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int, owner: NDArray[np.int64], n_cells: int
-) -> Contacts:
-    """Which labels touch in the voxels of a grid: hardly any area of some pairs, and then in which cells.
-
-    `owner` is the cell of each voxel, or -1.
-    """
-    steps = [
-        (np.moveaxis(partition, d, 0), np.moveaxis(owner, d, 0), float(np.prod(spacing) / spacing[d]))
-        for d in range(partition.ndim)
-    ]
+def label_voxels(partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int) -> LabelVoxels:
+    """Components of labels in the voxels of a grid, pairs that share hardly any area, and where those touch."""
+    steps = [np.moveaxis(partition, d, 0) for d in range(partition.ndim)]
     area = np.zeros(n_labels * n_labels)
-    for rows, _, face in steps:
-        area += face * np.bincount((n_labels * rows[:-1] + rows[1:]).ravel(), minlength=len(area))
+    for rows, step in zip(steps, spacing, strict=True):
+        area += np.prod(spacing) / step * np.bincount((n_labels * rows[:-1] + rows[1:]).ravel(), minlength=len(area))
     area = area.reshape(n_labels, n_labels) + area.reshape(n_labels, n_labels).T
     np.fill_diagonal(area, 0.0)
     surface = area.sum(axis=1)
     is_apart = area < LEAST_CONTACT_FRACTION * np.minimum(surface[:, None], surface)
     np.fill_diagonal(is_apart, False)
-    is_place = np.zeros(n_cells + 1, dtype=bool)
-    for rows, cells, _ in steps:
-        is_met = is_apart[rows[:-1], rows[1:]]
-        is_place[cells[:-1][is_met]] = is_place[cells[1:][is_met]] = True
-    return Contacts(is_apart, is_place[:-1].copy())
+    is_place = np.zeros(partition.shape, dtype=bool)
+    for d, rows in enumerate(steps):
+        is_met, here = is_apart[rows[:-1], rows[1:]], np.moveaxis(is_place, d, 0)
+        here[:-1] |= is_met
+        here[1:] |= is_met
+    return LabelVoxels(voxel_components(partition, n_labels), is_apart, np.flatnonzero(is_place))
 
 
 def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
