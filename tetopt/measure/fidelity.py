@@ -456,7 +456,7 @@ def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
     nodes, total = np.sort(surface_facets, axis=1).T, 0
     for size in range(1, len(nodes) + 1):
         chosen = np.array(list(combinations(range(len(nodes)), size)))
-        is_new = lexicographic_order([nodes[column].ravel() for column in chosen.T])[1]
+        is_new = lexicographic_order(np.column_stack([nodes[column].ravel() for column in chosen.T]))[1]
         total += (-1) ** (size - 1) * int(np.count_nonzero(is_new))
     return total
 
