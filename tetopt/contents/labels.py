@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -43,11 +44,10 @@ def check_labels(name: str, labels: Image) -> None:
 def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
     """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
     shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
-    block = np.ravel_multi_index(
-        np.meshgrid(*[np.arange(s) // APART_VOXELS for s in number.shape], indexing="ij"), shape
-    )
-    is_in = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
-    is_in[number.ravel(), block.ravel()] = True
+    is_in, block = np.zeros((n_labels, int(np.prod(shape))), dtype=bool), np.arange(np.prod(shape)).reshape(shape)
+    for place in itertools.product(range(APART_VOXELS), repeat=number.ndim):  # the voxels of all blocks in turn
+        part = number[tuple(slice(first, None, APART_VOXELS) for first in place)]
+        is_in[part, block[tuple(slice(n) for n in part.shape)]] = True
     is_beside = np.stack([scipy.ndimage.maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
     touches = is_beside.astype(np.float32) @ is_in.T.astype(np.float32) > 0.0
     channel = np.full(n_labels, -1, dtype=np.int64)
