@@ -35,7 +35,7 @@ QUADRATIC_RATIO = 1.15
 QUADRATIC_GRADATION = 0.5  # of sizes, likewise: gentler changes lower the displacement's error and the interfaces'
 # What a run that is over has left to lift flat cells: a part of the time that it took, and at least so much. Without
 # this bound slabs of 575 voxels took 27 to 200 s where one was asked for.
-GRACE_FRACTION, GRACE_SECONDS = 0.1, 1.0
+GRACE_FRACTION, GRACE_SECONDS = 0.1, 0.5
 E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
 
 Boundary = Literal["slide", "fixed"]
@@ -208,7 +208,7 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 
 def grace(begin: float, is_over: Callable[[], bool]) -> Callable[[], bool]:
-    """A function that tells whether a tenth of a run's time, or a second, has gone by since the run was over."""
+    """A function that tells whether a tenth of a run's time, or half a second, has gone by since the run was over."""
     ended: list[float] = []
 
     def is_late() -> bool:

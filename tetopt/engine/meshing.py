@@ -77,6 +77,7 @@ ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40
 ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
 CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 ERROR_RUNS = 6  # towards an error, at most
+LEAST_SECONDS = 1e-9  # of a run for which the initial mesh has left no time
 
 
 def mesh_image(
@@ -108,8 +109,7 @@ def mesh_image(
         be taken out; count them. Without it and `target_error`, as many as `sizes` take that have a target everywhere.
     target_error : float
         Instead of `nodes`, of a graded mesh: the fraction of the image's variance that may be left within cells, 0 to
-        1; as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
-        says so in `violated`.
+        1; as many nodes as that takes, found in a few runs. A run that ends above it says so in `violated`.
     mode : {"graded", "uniform", "paper", "start"}
         "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`, cut
         off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box.
@@ -137,7 +137,7 @@ def mesh_image(
         Called for each run with its initial mesh and a function that does it; returns the run's result. It may set up
         what watches a run: `lambda initial, run: run(callback=print)`.
     **options
-        Further ones of `optimize` or `optimize_paper`.
+        Further ones of `optimize` or `optimize_paper`. `max_seconds` is counted from the call on, over all runs.
 
     Returns
     -------
@@ -182,6 +182,7 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
+    begin = time.perf_counter()
     mode = ("graded" if start is None else "start") if mode is None else mode
     _check_names(options, optimize_paper if mode == "paper" else optimize)
     content = plain(image)
@@ -202,14 +203,17 @@ def mesh_image(
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
         def optimized(**more: Any) -> MeshingResult:
+            if options.get("max_seconds") is not None:  # of all runs, and of what they begin with
+                left = options["max_seconds"] - (time.perf_counter() - begin)
+                more = {"max_seconds": max(left, LEAST_SECONDS), **more}
             if mode == "paper":
-                return optimize_paper(content.image, initial, **options, **more)
+                return optimize_paper(content.image, initial, **(options | more))
             exchanged = nodes if mode == "graded" else None
-            return optimize(content, initial, nodes=exchanged, sizes=sizes, **options, **more)
+            return optimize(content, initial, nodes=exchanged, sizes=sizes, **(options | more))
 
-        begin = time.perf_counter()
+        begun_run = time.perf_counter()
         result = optimized() if watch is None else watch(initial, optimized)
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.perf_counter() - begun_run)
         return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
 
     def begun(corners: int | None) -> MeshingResult:
@@ -218,7 +222,6 @@ def mesh_image(
             return run((octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes), corners)
         return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
 
-    begin = time.perf_counter()
     if target_error is not None:
         result = meshed_to_error(content, target_error, sizes, run)
     elif start is not None:
