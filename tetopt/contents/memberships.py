@@ -324,8 +324,8 @@ def with_volume(
 ) -> NDArray[np.float32]:
     """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`.
 
-    Within lower and upper `bounds`, if they are given. Both passes over the voxels are kernels: numpy's of one operation
-    each took three times as long.
+    Within lower and upper `bounds`, if they are given. Both passes over the voxels are kernels: numpy took three times
+    as long.
     """
     mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, of the level that is linear between centres
     whole = (1,) * (3 - level.ndim) + level.shape
@@ -334,10 +334,9 @@ def with_volume(
     _fill_block_sums(missing, area, level.reshape(whole), mean.reshape(whole), raw.reshape(whole))
     missing, area = (_blurred(sums.reshape(sums.shape[3 - level.ndim :]), sigma) for sums in (missing, area))
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), np.float32(0.0))
-    low, high = bounds or (np.float32([-np.inf]), np.float32([np.inf]))
-    low, high = (np.broadcast_to(bound.reshape((1,) * (3 - bound.ndim) + bound.shape), whole) for bound in (low, high))
+    low, high = bounds or (np.full_like(level, -np.inf), np.full_like(level, np.inf))
     result = np.empty(whole, dtype=np.float32)
-    _fill_lowered(result, level.reshape(whole), lowered.reshape(blocks), low, high)
+    _fill_lowered(result, level.reshape(whole), lowered.reshape(blocks), low.reshape(whole), high.reshape(whole))
     return result.reshape(level.shape)
 
 

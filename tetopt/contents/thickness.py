@@ -256,7 +256,7 @@ def _spread_balls(
     thickness: NDArray, chord: NDArray, is_middle: NDArray, partition: NDArray, edges: NDArray,
     slab: tuple[tuple[int, int], ...],
 ) -> None:  # fmt: skip
-    """Raise the thickness of each voxel of a slab to the diameter of the largest ball around a middle that covers it."""
+    """Raise each voxel's thickness, in a slab, to the diameter of the largest ball around a middle that covers it."""
     for i in range(partition.shape[0]):
         for j in range(partition.shape[1]):
             for k in range(partition.shape[2]):

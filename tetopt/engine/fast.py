@@ -125,7 +125,7 @@ def optimize(
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
         Stop at the next colour of nodes after this time; the mesh is valid. Cells are lifted above the minimum dihedral
-        angle for a tenth of the run's time more, or half a second; flips of an iteration and labels take theirs besides.
+        angle for a tenth of the run's time more, or half a second; flips of an iteration and labels take more.
     callback : callable, optional
         Called with each `IterationRecord`; without one a notebook shows a bar. Its E_G is the weighted one, its
         `is_retessellated` whether cells were exchanged.

@@ -144,20 +144,20 @@ def cell_contents(
     _count_centres(n_owned, n_of, owner, partition)
     is_sampled = n_owned < FEWEST_CENTRES
     start = np.append(0, np.cumsum(np.where(is_sampled, len(inner), n_owned)))
-    found = np.empty(start[-1], dtype=np.int32)
-    _place_centres(found, start[:-1].copy(), owner, partition, is_sampled)
+    entries = np.empty(start[-1], dtype=np.int32)
+    _place_centres(entries, start[:-1].copy(), owner, partition, is_sampled)
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
     parts = np.array_split(sampled, 1 + len(sampled) // SAMPLED_AT_ONCE)
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
         rows = threads.map(lambda part: labels_at(members, index, mesh.cells[part], inner), parts)
         for part, there in zip(parts, rows, strict=True):
-            found[start[part, None] + np.arange(len(inner))] = there
+            entries[start[part, None] + np.arange(len(inner))] = there
     each = np.where(is_sampled, np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / len(inner), 1.0)
     first = np.zeros(n_cells + 1, dtype=np.int64)
-    _count_kinds(first, found, start, n_labels)
+    _count_kinds(first, entries, start, n_labels)
     np.cumsum(first, out=first)
     row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
-    _sum_kinds(row, volume, first, found, start, each, n_labels)
+    _sum_kinds(row, volume, first, entries, start, each, n_labels)
     counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
     # Between the samples a label of a voxel or two is not seen: it has its centres.
     is_unseen = np.bincount(row, volume, n_labels) < SAMPLED_FRACTION * n_of
@@ -181,34 +181,34 @@ def _count_centres(n_owned: NDArray, n_of: NDArray, owner: NDArray, partition: N
 
 
 @njit(cache=True, nogil=True)
-def _place_centres(found: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray) -> None:
+def _place_centres(entries: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray) -> None:
     for v in range(len(owner)):
         cell = owner[v]
         if cell >= 0 and not is_sampled[cell]:
-            found[end[cell]] = partition[v]
+            entries[end[cell]] = partition[v]
             end[cell] += 1
 
 
 @njit(cache=True, nogil=True)
-def _count_kinds(first: NDArray, found: NDArray, start: NDArray, n_labels: int) -> None:
+def _count_kinds(first: NDArray, entries: NDArray, start: NDArray, n_labels: int) -> None:
     """Count the labels that each cell has any of."""
     last = np.full(n_labels, -1, dtype=np.int64)
     for cell in range(len(start) - 1):
         for i in range(start[cell], start[cell + 1]):
-            if last[found[i]] != cell:
-                last[found[i]] = cell
+            if last[entries[i]] != cell:
+                last[entries[i]] = cell
                 first[cell + 1] += 1
 
 
 @njit(cache=True, nogil=True)
 def _sum_kinds(
-    row: NDArray, volume: NDArray, first: NDArray, found: NDArray, start: NDArray, each: NDArray, n_labels: int
+    row: NDArray, volume: NDArray, first: NDArray, entries: NDArray, start: NDArray, each: NDArray, n_labels: int
 ) -> None:
     total = np.zeros(n_labels)
     for cell in range(len(start) - 1):
         end = first[cell]
         for i in range(start[cell], start[cell + 1]):
-            label = found[i]
+            label = entries[i]
             if total[label] == 0.0:
                 m = end
                 while m > first[cell] and row[m - 1] > label:  # in rising order

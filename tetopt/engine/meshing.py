@@ -77,7 +77,7 @@ ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40
 ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
 CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 ERROR_RUNS = 6  # towards an error, at most
-LEAST_SECONDS = 1e-9  # of a run for which the initial mesh has left no time
+SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh has left no time
 
 
 def mesh_image(
@@ -203,17 +203,15 @@ def mesh_image(
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
         def optimized(**more: Any) -> MeshingResult:
-            if options.get("max_seconds") is not None:  # of all runs, and of what they begin with
-                left = options["max_seconds"] - (time.perf_counter() - begin)
-                more = {"max_seconds": max(left, LEAST_SECONDS), **more}
+            more = _time_left(options, begin) | more
             if mode == "paper":
                 return optimize_paper(content.image, initial, **(options | more))
             exchanged = nodes if mode == "graded" else None
             return optimize(content, initial, nodes=exchanged, sizes=sizes, **(options | more))
 
-        begun_run = time.perf_counter()
+        start_of_run = time.perf_counter()
         result = optimized() if watch is None else watch(initial, optimized)
-        seconds.append(time.perf_counter() - begun_run)
+        seconds.append(time.perf_counter() - start_of_run)
         return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
 
     def begun(corners: int | None) -> MeshingResult:
@@ -234,6 +232,13 @@ def mesh_image(
     if order == 2:
         result = _curved(result, content)
     return result._replace(seconds_start=time.perf_counter() - begin - sum(seconds), seconds_run=sum(seconds))
+
+
+def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
+    """The `max_seconds` of a run, which are those of all runs and of what they begin with, if they are limited."""
+    if options.get("max_seconds") is None:
+        return {}
+    return {"max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)}
 
 
 def _curved(result: MeshingResult, content: Content) -> MeshingResult:

@@ -133,9 +133,7 @@ def _sorted_within(order: NDArray, start: NDArray, rows: NDArray) -> NDArray:
 
 
 @njit(cache=True, nogil=True)
-def _listed_facets(
-    order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArray
-) -> tuple[NDArray, NDArray, NDArray]:
+def _listed_facets(order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """The first three fields of `Facets` but the number of cells, from the order of the facets of all cells."""
     n_facets, n = is_first.sum(), rows.shape[1]
     nodes, of_cell = np.empty((n_facets, n), dtype=np.int64), np.empty(sign.shape, dtype=np.int64)
