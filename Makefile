@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo check test test-deep test-mutants dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -71,6 +71,10 @@ test-lowest:
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest $(LOWEST)/bin/tetopt warm-up
 	PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest MPLBACKEND=agg \
 	  $(LOWEST)/bin/python -m pytest -m "not slow" $(ALL_CORES)
+
+# The README's commands with Debian's own Pythons, 3.13 and the newest, each in a bare root, as root: half an hour.
+test-pythons:
+	bash .ci/pythons
 
 # A million random operations of the engine, 500 random whole runs and 500 of labels by the defaults, two hours.
 test-random: $(VENV)/.test
