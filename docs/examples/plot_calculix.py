@@ -1,9 +1,8 @@
 """
-CalculiX, there and back
-========================
+Solve with CalculiX and read the results
+========================================
 
-A mesh with moduli and loads is written for CalculiX, CalculiX solves it, and its displacements and stresses come back
-onto the mesh.
+Write a mesh with moduli and loads for CalculiX, solve it, and read displacements and stresses back onto the mesh.
 """
 
 import shutil
@@ -17,18 +16,18 @@ import pyvista
 import tetopt
 
 # %%
-# The phantom's intensities are Young's moduli in kPa. Cells are grouped into twelve materials, the top is held, and the
-# bottom is pushed in by 5 % of the height.
+# The phantom's intensities are Young's moduli in kPa. Cells are grouped into twelve materials. The top is fixed, and
+# the bottom is pushed in by 5 % of the height.
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=400).mesh
 model = tetopt.build_model(mesh, image, young="h", nu=0.4, bins=12, loads=["compress:5%"])
 
 # %%
-# The input file is complete: ``ccx -i block`` needs no more. Where ``ccx`` is not installed, this program reads
-# ``plot_calculix.frd``, the result that CalculiX 2.20 computed of the same file, which lies beside it.
+# The input file is complete: run ``ccx -i block``. If ``ccx`` is not installed, this program reads
+# ``plot_calculix.frd`` instead, which CalculiX 2.20 computed from the same file.
 #
-# ``tetopt.read_frd`` compares nodes and cells with the mesh and refuses the result of another one.
+# ``tetopt.read_frd`` compares nodes and cells with the mesh and refuses results of another mesh.
 
 kept = Path("plot_calculix.frd").absolute()
 with tempfile.TemporaryDirectory() as folder:
@@ -40,7 +39,7 @@ with tempfile.TemporaryDirectory() as folder:
         results = tetopt.read_frd(kept, mesh)
 
 # %%
-# Displacements are in mm and stresses in kPa, a row a node.
+# Displacements are in mm and stresses in kPa, one row per node.
 
 displacement = results.point_data["displacement"]
 stress_kPa = results.point_data["von_mises_nodes"]
@@ -49,8 +48,8 @@ print(f"largest displacement {np.linalg.norm(displacement, axis=1).max():.2f} mm
 print(f"largest von Mises stress {largest_stress:.2f} kPa")
 
 # %%
-# The deformed block, its displacement drawn twice as large, opened along the middle. The small sphere is twelve times
-# as stiff as what is around it, and carries the most.
+# The deformed block, cut along the middle, with displacements doubled. The small sphere is twelve times as stiff as its
+# surroundings and carries the highest stress.
 
 grid = mesh.to_pyvista(point_data={"displacement": displacement, "von Mises stress, kPa": stress_kPa})
 half = grid.clip("y", crinkle=True).warp_by_vector("displacement", factor=2.0)

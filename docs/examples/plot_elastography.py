@@ -1,9 +1,9 @@
 """
-Elastography: a modulus of 1/strain
-===================================
+Map elastography strain to moduli
+=================================
 
-Quasi-static elastography presses tissue and images its strain. Under the assumption that the stress is the same
-everywhere, the modulus is proportional to 1/strain: the strain image becomes a mesh with moduli in one step.
+Quasi-static elastography compresses tissue and images its strain. If the stress is assumed uniform, the modulus is
+proportional to 1/strain, and the strain image becomes a mesh with moduli in one step.
 """
 
 import matplotlib.pyplot as plt
@@ -12,8 +12,8 @@ import numpy as np
 import tetopt
 
 # %%
-# The strain image is simulated. A gland with two stiff nodules, whose moduli are known, is compressed by 1 % on a fine
-# mesh of quadratic cells; each voxel gets the axial strain of the cell that it lies in, and 2 % of noise.
+# Simulate the strain image: compress a gland with two stiff nodules of known moduli by 1 %, on a fine mesh of quadratic
+# elements. Each voxel gets the axial strain of its cell, plus 2 % of noise.
 
 truth = tetopt.load_phantom("prostate_2d").image()
 fine = tetopt.mesh_image(truth, nodes=2500).mesh
@@ -24,17 +24,16 @@ noise = 1.0 + 0.02 * np.random.default_rng(0).standard_normal(truth.shape)
 strain = tetopt.Image(axial[tetopt.cell_of_voxel(truth, fine)] * noise, truth.affine)
 
 # %%
-# The modulus mapping is 1/strain, scaled so that the stress is 0.1 kPa; ``max`` keeps noise around 0 from making moduli
-# infinite. Voxels are noisy, but a cell averages over many, and where the image varies by noise alone no nodes are
-# spent.
+# The modulus mapping is 1/strain, scaled to a stress of 0.1 kPa; ``max`` prevents infinite moduli where noise is near
+# 0. Voxels are noisy, but a cell averages over many, and tetopt spends no nodes on noise alone.
 
 mesh = tetopt.mesh_image(strain, nodes=400).mesh
 model = tetopt.build_model(mesh, strain, young="0.1/max(abs(h), 0.001)", nu=0.45)
 young = model.materials.young[model.materials.of_cell]
 
 # %%
-# The large nodule is 6 times as stiff as the tissue around the gland. From 1/strain it seems less stiff than it is,
-# since stress gathers in what is stiff: that is the assumption's error, not the mesh's.
+# The large nodule is 6 times as stiff as the tissue around the gland. 1/strain underestimates this, since stress
+# concentrates in stiff regions: an error of the assumption, not of the mesh.
 
 labels = tetopt.load_phantom("prostate_2d").label_image()
 of_cell = tetopt.cell_labels(labels, mesh)
@@ -42,7 +41,7 @@ contrast = np.median(young[of_cell == 2]) / np.median(young[of_cell == 0])
 print(f"the large nodule is {contrast:.2f} times as stiff as the surroundings, by 1/strain; in truth 6 times")
 
 # %%
-# The strain image, the mesh with its moduli, and the moduli as they are.
+# The strain image, the mesh with its moduli, and the true moduli.
 
 extent = (-28, 28, -28, 28)
 figure, axes = plt.subplots(1, 3, figsize=(12.5, 4.2), layout="constrained")

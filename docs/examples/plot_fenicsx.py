@@ -1,9 +1,9 @@
 """
-FEniCSx: the file, and the program that reads it
-================================================
+Export to FEniCSx
+=================
 
-``tetopt.save_model`` writes XDMF with the moduli of the cells and the sets as tags. Here is the file, the lines of
-dolfinx that read it, and what is in it. dolfinx itself is not run on this page, so that it need not be installed.
+``tetopt.save_model`` writes XDMF with the moduli of the elements, and the sets as tags. This program writes the file,
+shows its content, and prints the dolfinx code that reads it. It does not run dolfinx, which need not be installed.
 """
 
 import tempfile
@@ -16,7 +16,7 @@ import pyvista
 import tetopt
 
 # %%
-# A head of nested ellipsoids, compressed by 5 %, with a modulus that grows with the intensity.
+# A head of nested ellipsoids, compressed by 5 %, with a modulus that increases with intensity.
 
 image = tetopt.load_phantom("ellipsoids_brain").image(voxel_mm=4.0)
 mesh = tetopt.mesh_image(image, nodes=1500).mesh
@@ -26,8 +26,8 @@ path = Path(folder.name) / "head.xdmf"
 tetopt.save_model(path, model)
 
 # %%
-# These lines of dolfinx read the mesh, the numbers of the cells' materials, and the tags of the facets. A tag stands
-# for one combination of sets, and the file says which tags a set has. :doc:`/reference/formats` says more.
+# This dolfinx code reads the mesh, the material number of each cell, and the facet tags. A tag stands for one
+# combination of sets; the file lists the tags of each set. See :doc:`/reference/formats`.
 
 PROGRAM = """
 from xml.etree import ElementTree
@@ -48,7 +48,7 @@ superior = facets.indices[np.isin(facets.values, np.array(tags.split(), dtype=in
 print(PROGRAM)
 
 # %%
-# The file's text says which grids it has, and which sets and loads there are by name.
+# The file's XML lists its grids, sets and loads by name.
 
 root = ET.parse(path).getroot()
 for grid in root.findall("./Domain/Grid/Information/Grid/Grid"):
@@ -57,8 +57,7 @@ for load in root.findall("./Domain/Grid/Information[@Name='load']"):
     print("load", load.get("Value"))
 
 # %%
-# VTK reads the file as well, and so does pyvista; meshio does not, since it takes files of one grid. The moduli are the
-# model's.
+# VTK and pyvista also read the file. The moduli are the model's.
 
 read = pyvista.get_reader(path).read()["mesh"]
 folder.cleanup()
@@ -67,7 +66,7 @@ largest_kPa = young.max()
 print(f"Young's modulus from {young.min():.2f} to {largest_kPa:.2f} kPa in {read.n_cells} cells")
 
 # %%
-# The moduli that were read, on the mesh without its front left quarter.
+# The moduli from the file, on the mesh without its front left quarter.
 
 grid = mesh.to_pyvista({"Young's modulus, kPa": young})
 is_cut = (grid.cell_centers().points[:, :2] * (-1, 1) > 0).all(axis=1)

@@ -1,9 +1,9 @@
 """
-From the mesh onto an image, and back
-=====================================
+Transfer fields between mesh and image
+======================================
 
-What a simulation finds at nodes can be put onto the image's voxels and saved as NIfTI, so that imaging software shows
-it; and what lies on voxels comes back onto cells exactly, or onto nodes by interpolation.
+Put simulation results onto the image's voxels and save them as NIfTI, for imaging software. Voxel values return to
+cells exactly, or to nodes by interpolation.
 """
 
 import tempfile
@@ -27,8 +27,8 @@ solution = tetopt.solve(model)
 fields = tetopt.solution_fields(mesh, solution)
 
 # %%
-# Every voxel lies in exactly one cell, so that a value of each cell becomes an image by one indexing. The mean over the
-# voxels of a cell gives it back; cells without a voxel take the nearest.
+# Every voxel lies in exactly one cell, so indexing turns cell values into an image. The mean over a cell's voxels
+# recovers them; cells without voxels take the nearest voxel's value.
 
 stress = tetopt.Image(fields.cell_data["von_mises"][tetopt.cell_of_voxel(image, mesh)], image.affine)
 cells = tetopt.cell_moments(stress, mesh)
@@ -49,8 +49,8 @@ with tempfile.TemporaryDirectory() as folder:
     read = nibabel.load(path).get_fdata()
 
 # %%
-# Back at the nodes by linear interpolation between voxels. What is lost is what varies within a voxel of 2 mm, most of
-# it at the edges of the spheres.
+# Linear interpolation between voxels returns them to the nodes. Variation within a 2 mm voxel is lost, mostly at the
+# edges of the spheres.
 
 index = image.to_index(mesh.points).T
 back = np.stack([map_coordinates(read[..., axis], index, order=1, mode="nearest") for axis in range(3)], axis=1)
@@ -59,7 +59,7 @@ off_mm = np.linalg.norm(back - solution.u, axis=1)[is_inside].mean()
 print(f"displacement: off by {off_mm:.4f} mm in the mean, of up to {np.abs(solution.u).max():.1f} mm")
 
 # %%
-# The middle slice: stress and displacement on the voxels, over the image's own contours.
+# Stress and displacement on the voxels of the middle slice, with contours of the image.
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
 middle = image.shape[1] // 2 - 1

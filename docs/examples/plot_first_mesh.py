@@ -1,9 +1,9 @@
 """
-A first mesh
-============
+Make a first mesh
+=================
 
-Two stiff spheres in a soft block become a mesh of 800 nodes, with small cells where the image varies and large ones
-where it does not. One number says how much of the image the cells still miss.
+Mesh two stiff spheres in a soft block with 800 nodes. Cells are small where the image has detail and large elsewhere.
+One number tells how much of the image the cells miss.
 """
 
 import pyvista
@@ -11,30 +11,29 @@ import pyvista
 import tetopt
 
 # %%
-# An image is an array of voxels and the affine that says where they lie. This one is a phantom;
-# ``tetopt.load_image("T1.nii.gz")`` reads a file of yours.
+# An image is an array of voxels with an affine. This one is a phantom; ``tetopt.load_image("T1.nii.gz")`` reads a file.
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
 print(image.shape, "voxels, intensities", image.data.min(), "to", image.data.max())
 
 # %%
-# One call makes the mesh. It needs the image and the number of nodes, and no segmentation.
+# One call makes the mesh from the image and the number of nodes. No segmentation is needed.
 
 result = tetopt.mesh_image(image, nodes=800)
 mesh = result.mesh
 print(len(mesh.points), "nodes,", len(mesh.cells), "tetrahedra")
 
 # %%
-# Each cell stands for one value, the mean of its voxels. What varies around these means is lost to a simulation: E_D is
-# that variance times the volume, and it is given as a fraction of the variance of the whole image. 0.01 means that the
-# cells keep 99 % of it.
+# Each cell represents one value, the mean of its voxels; a simulation does not see the variation around it. E_D is that
+# variance times the volume. Divided by the variance of the whole image, it is the unexplained variance: at 0.01, the
+# cells explain 99 % of the image.
 
 fraction = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 print(f"{fraction:.5f} of the variance is left inside the cells")
 
 # %%
-# The mesh cut through the middle of both spheres, each cell in the colour of its mean. Whole cells are shown, so that
-# the cut is as rough as they are.
+# The mesh cut through the middle of both spheres, cells coloured by their mean. The cut is rough because it shows whole
+# cells.
 
 grid = mesh.to_pyvista({"mean": tetopt.cell_moments(image, mesh).mean})
 half = grid.clip("y", crinkle=True)

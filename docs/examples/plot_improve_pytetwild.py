@@ -1,9 +1,9 @@
 """
-Improve a mesh that another program made
-========================================
+Improve another program's mesh
+==============================
 
-A mesh of pytetwild's knows the surface of a body and nothing of the image. tetopt moves its inner nodes and connects
-them anew until cells keep to the image, and no angle falls under 12 degrees. The boundary stays, node for node.
+pytetwild meshes the surface of a body and ignores the image. tetopt moves and reconnects the inner nodes until cells
+follow the image, and keeps all angles at 12 degrees or more. The boundary stays the same, node for node.
 """
 
 import contextlib
@@ -16,8 +16,7 @@ import pyvista
 import tetopt
 
 # %%
-# An ellipsoid around the two spheres of a phantom, filled with tetrahedra by pytetwild. Its result may differ a little
-# from machine to machine.
+# pytetwild fills an ellipsoid around the two spheres of a phantom. Its result may differ slightly between machines.
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
 ball = pyvista.Sphere(radius=1.0, theta_resolution=30, phi_resolution=30)
@@ -29,8 +28,8 @@ with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # pytet
 before = tetopt.Mesh.from_meshio(meshio.Mesh(points, [("tetra", cells)]))
 
 # %%
-# ``start`` is the mesh to improve, whatever made it. k_D is the weight of the image; the default for other programs'
-# meshes, 0.02, is careful with the shape.
+# ``start`` is the mesh to improve, from any program. k_D is the weight of the image; for such meshes its default, 0.02,
+# favours shape.
 
 after = tetopt.mesh_image(image, start=before, k_D=0.2).mesh
 for name, mesh in (("pytetwild's", before), ("improved", after)):
@@ -39,13 +38,13 @@ for name, mesh in (("pytetwild's", before), ("improved", after)):
     print(f"{name:11}: {len(mesh.points)} nodes, {fraction:.4f} left, angles from {shape.min_dihedral:.1f} degrees")
 
 # %%
-# With the same nodes on the boundary, and as many inside, a good quarter of the variance in the cells remains.
+# With the same boundary nodes and as many inner nodes, a good quarter of the variance inside the cells remains.
 
 remaining = tetopt.E_D(image, after) / tetopt.E_D(image, before)
 print(f"{remaining:.2f} of what pytetwild's cells left")
 
 # %%
-# The two meshes, cut open: on the left with cells across the spheres' surfaces, on the right with cells along them.
+# Both meshes, cut open: on the left, cells cross the spheres' surfaces; on the right, they follow them.
 
 plotter = pyvista.Plotter(shape=(1, 2), window_size=(1300, 560), border=False)
 for column, mesh in enumerate((before, after)):

@@ -1,9 +1,9 @@
 """
-A thin layer of fluid
-=====================
+Preserve a thin layer of fluid
+==============================
 
-Where the layer of fluid around a brain is torn, brain and skull are coupled, and a simulation is wrong. This program
-meshes nested shells with sizes by the thickness of their labels, and measures what became of the thin one.
+If the layer of fluid around a brain is torn, brain and skull are coupled and a simulation is wrong. Mesh nested shells
+with sizes from label thickness, and measure the thin shell.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ import pyvista
 import tetopt
 
 # %%
-# A brain of 9 mm radius lies in 3 mm of fluid, 3 mm of bone, and soft tissue. The labels alone are meshed: the image
-# has the weight 0.
+# A brain of 9 mm radius lies in 3 mm of fluid, 3 mm of bone, and soft tissue. Only the labels count: the image has
+# weight 0.
 
 NAMES = {1: "brain", 2: "fluid", 3: "bone", 4: "soft"}
 radius = np.linalg.norm(np.indices((36, 36, 36)) - 17.9, axis=0)
@@ -21,8 +21,7 @@ labels = tetopt.Image(1.0 + (radius > 9.0) + (radius > 12.0) + (radius > 15.0))
 content = tetopt.content(labels, labels, weights=[0.0])
 
 # %%
-# `cells_across=2` asks for edges of half of the thickness. `sizes_by_label` says how many nodes that takes, before
-# anything is meshed.
+# `cells_across=2` requests edges of half the thickness. `sizes_by_label` predicts the number of nodes before meshing.
 
 two_across = tetopt.Sizes(edge_size=8.0, cells_across=2)
 planned = tetopt.sizes_by_label(two_across, content)
@@ -31,9 +30,9 @@ for row in planned.layers:
 print(f"that takes about {planned.nodes} nodes")
 
 # %%
-# The same phantom is meshed with 500 nodes and no sizes, and with the sizes. The fluid of the first is one cell thick:
-# each node of its cells lies on its surface, and a displacement cannot vary across it as it should. Contact of brain
-# and bone would be false in every mm2, since their voxels touch nowhere; there is none in either mesh.
+# Mesh the phantom with 500 nodes without sizes, and with them. Without sizes, the fluid is one cell thick: each node of
+# its cells lies on its surface, and the displacement cannot vary across it properly. Voxels of brain and bone do not
+# touch, so any contact would be false; neither mesh has any.
 
 
 def judge(result):
@@ -52,13 +51,13 @@ for name, result in (("without sizes", without), ("two cells across", sized)):
     print(f"brain and bone touch in {touching_mm2:.1f} mm2")
 
 # %%
-# The thickness of the fluid between the facets of its cells, beside that between the smooth surfaces of its voxels:
+# Compare the thickness of the fluid between its facets with that between the smooth surfaces of its voxels:
 
 of_voxels, of_cells = tetopt.label_thickness(content, sized.mesh, sized.labels)[2]
 print(f"fluid: {of_voxels.p50:.2f} mm of voxels, {of_cells.p50:.2f} mm of cells")
 
 # %%
-# Both meshes cut in the middle: without sizes, and two cells across.
+# Both meshes, cut in the middle: without sizes, and two cells across.
 
 COLOURS = {1: "#c9867b", 2: "#3f7fbf", 3: "#f4ead5", 4: "#566072"}
 plotter = pyvista.Plotter(shape=(1, 2), window_size=(1000, 520))

@@ -1,9 +1,9 @@
 """
-An organ from a mask
-====================
+Mesh an organ from a mask
+=========================
 
-With a mask the cells fill the organ alone, and the mesh's boundary is smooth where the mask's voxels are stairs. Here
-the organ is the brain of MNI152.
+With a mask, cells fill only the organ, and the boundary is smooth although the mask's voxels form stairs. The organ
+here is the brain of MNI152.
 """
 
 import numpy as np
@@ -13,28 +13,28 @@ from nilearn.datasets import load_mni152_template
 import tetopt
 
 # %%
-# Every third voxel of the T1 in nilearn's wheel, to be quick. The mask is 1 in the brain and 0 around it; a mask on
-# another grid comes onto the image's by ``tetopt.resample_mask``.
+# Use every third voxel of the T1 in nilearn's wheel, to save time. The mask is 1 in the brain and 0 outside. For a mask
+# on another grid, use ``tetopt.resample_mask``.
 
 template = load_mni152_template(resolution=1)
 image = tetopt.Image(template.get_fdata()[::3, ::3, ::3], template.affine @ np.diag([3, 3, 3, 1]))
 mask = tetopt.Image(1.0 * (image.data > 0), image.affine)
 
 # %%
-# ``tetopt.content`` puts together what a mesh is to represent, and stands where an image does.
+# ``tetopt.content`` combines image and mask, and replaces the image in the call.
 
 mesh = tetopt.mesh_image(tetopt.content(image, mask=mask), nodes=3000).mesh
 
 # %%
-# Dice compares the voxels inside the mesh with the mask's, and the distance is from the mesh's boundary to the surface
-# halfway between the mask's voxels.
+# Dice compares the voxels inside the mesh with the mask. The distance is from the mesh boundary to the surface halfway
+# between the mask's voxels.
 
 fidelity = tetopt.mask_fidelity(mask, mesh)
 dice = fidelity.dice
 print(f"Dice {dice:.4f}, boundary off by {fidelity.distance_mean:.2f} voxels in the mean")
 
 # %%
-# The mesh with an octant cut out, each cell in the grey of its mean.
+# The mesh without one octant, cells in the grey of their mean.
 
 grid = mesh.to_pyvista({"mean": tetopt.cell_moments(image, mesh).mean})
 middle = np.array([0.0, -18.0, 10.0])

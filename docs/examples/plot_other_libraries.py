@@ -1,9 +1,8 @@
 """
-A mesh in meshio, pyvista and trimesh
-=====================================
+Use meshio, pyvista and trimesh
+===============================
 
-The mesh's file is VTU, which most programs of the field read; and in Python a mesh goes to other libraries, and comes
-back, without a file.
+The mesh file is VTU, which most programs read. In Python, convert a mesh to other libraries and back without a file.
 """
 
 import tempfile
@@ -16,7 +15,7 @@ import trimesh
 import tetopt
 
 # %%
-# The file has the mean of the image in each cell, and more.
+# The file has the image mean of each cell, and more.
 
 image = tetopt.load_phantom("sphere").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=900).mesh
@@ -34,15 +33,15 @@ print("meshio:", len(of_meshio.points), "nodes, cell data", ", ".join(of_meshio.
 print("pyvista:", of_pyvista.n_cells, "cells of", f"{of_pyvista.compute_cell_sizes()['Volume'].sum():.0f} mm3")
 
 # %%
-# Without a file, ``to_meshio``, ``to_pyvista``, ``to_skfem`` and ``to_trimesh`` make the same objects, and
-# ``tetopt.Mesh.from_pyvista`` and its like go the other way.
+# Without a file, ``to_meshio``, ``to_pyvista``, ``to_skfem`` and ``to_trimesh`` create such objects;
+# ``tetopt.Mesh.from_pyvista`` and its siblings convert back.
 
 again = tetopt.Mesh.from_pyvista(mesh.to_pyvista())
 print("there and back:", (again.points == mesh.points).all() and (again.cells == mesh.cells).all())
 
 # %%
-# trimesh holds surfaces. ``to_trimesh`` is the boundary of the whole mesh; the boundary of chosen cells comes from
-# ``tetopt.extract_surface``, which is closed. A sphere of 20 mm radius has 33,510 mm3.
+# trimesh represents surfaces. ``to_trimesh`` returns the boundary of the whole mesh, ``tetopt.extract_surface`` the
+# closed boundary of selected cells. A sphere of 20 mm radius has 33,510 mm3.
 
 chosen = tetopt.cell_moments(image, mesh).mean > 60
 closed = tetopt.extract_surface(mesh.points, mesh.cells, chosen)
@@ -51,7 +50,7 @@ volume_mm3 = surface.volume
 print(f"trimesh: watertight {surface.is_watertight}, {volume_mm3:.1f} mm3")
 
 # %%
-# The cells that pyvista read, cut through the middle, and before them the surface that trimesh holds.
+# The cells from pyvista, cut through the middle, and in front of them the surface from trimesh.
 
 plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")

@@ -2,8 +2,8 @@
 Write a format of your own
 ==========================
 
-A solver that tetopt has no writer for takes a function from a model to text, and one line that registers it. Here it
-is SOFA: a scene with the mesh, a modulus for each cell, supports, forces and springs. No SOFA has run it here.
+To support another solver, write a function from a model to text and register it in one line. The example is SOFA: a
+scene with the mesh, a modulus per element, supports, forces and springs. Not yet verified in SOFA.
 """
 
 import tempfile
@@ -17,8 +17,8 @@ import tetopt
 from tetopt.model.loads import facet_forces, spring_constants
 
 # %%
-# A model has points in mm, cells, sets of facets as rows (cell, node opposite), materials and loads. `repr` writes a
-# number without losing a digit. Each load becomes one object of SOFA; what a scene cannot carry is refused in a line.
+# A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads. `repr` writes a number
+# without losing a digit. Each load becomes one SOFA object; anything that a scene cannot represent is refused.
 
 
 def listed(numbers):
@@ -34,7 +34,7 @@ def nodes_of(model, name):
 
 
 def load_of(model, load):
-    """The component of SOFA's that a load becomes, and its values."""
+    """The SOFA component of a load, and its values."""
     if load.kind == "spring":
         nodes, stiffness = spring_constants(model.mesh, model.sets, load)
         return "RestShapeSpringsForceField", {"points": listed(nodes), "stiffness": listed(stiffness)}
@@ -46,12 +46,12 @@ def load_of(model, load):
         raise tetopt.InputError("sofa: a set moves in all directions or in none; give numbers instead of free")
     if not load.numbers.any():
         return "FixedProjectiveConstraint", {"indices": indices}
-    path = listed([[0, 0, 0], load.numbers, load.numbers])  # from 0 to 1 s, and held from then on
+    path = listed([[0, 0, 0], load.numbers, load.numbers])  # from 0 to 1 s, then fixed
     return "LinearMovementProjectiveConstraint", {"indices": indices, "keyTimes": "0 1 1e9", "movements": path}
 
 
 def sofa(model):
-    """A scene for SOFA v24.12, which rests in equilibrium at t = 2 s."""
+    """A scene for SOFA v24.12, in equilibrium at t = 2 s."""
     if model.mesh.ndim != 3 or model.materials is None or any(load.step for load in model.loads):
         raise tetopt.InputError("sofa: expected tetrahedra, a modulus mapping (`young`) and loads of one step")
     mesh, materials = model.mesh, model.materials
@@ -90,8 +90,8 @@ def sofa(model):
 
 
 # %%
-# From here on `.scn` is a suffix like any other in this process: `tetopt.save_model` writes it, whole or not at all,
-# and so do `tetopt.run` and the command (`from tetopt.cli import main`).
+# From here on, this process knows the suffix `.scn`: `tetopt.save_model` writes it, whole or not at all, as do
+# `tetopt.run` and the command (`from tetopt.cli import main`).
 
 tetopt.register_format(".scn", sofa, "SOFA scene", runs=True)
 
@@ -105,15 +105,15 @@ with tempfile.TemporaryDirectory() as folder:
     solid = ET.parse(path).find("Node[@name='solid']")
 
 # %%
-# Read the file back with something that did not write it. Here the forces in the scene add up to the pressure, 0.1 kPa,
-# times the area of the side it acts on.
+# Read the file back with an independent reader. The forces in the scene add up to the pressure, 0.1 kPa, times the area
+# of the loaded side.
 
 forces = np.array(solid.find("ConstantForceField").get("forces").split(), dtype=float).reshape(-1, 3)
 total_mN = -forces.sum(axis=0)[2]
 print(f"force on the upper side: {total_mN:.1f} mN")
 
 # %%
-# The nodes that the scene holds, in red, and those that it pushes, in blue.
+# Fixed nodes in red, loaded nodes in blue.
 
 held_nodes = np.array(solid.find("FixedProjectiveConstraint").get("indices").split(), dtype=int)
 pushed_nodes = np.array(solid.find("ConstantForceField").get("indices").split(), dtype=int)

@@ -1,9 +1,9 @@
 """
-A phantom of one's own
+Write your own phantom
 ======================
 
-A phantom is a table of shapes with exactly known intensities. It is the quickest way to try a mesh, a modulus mapping
-or a simulation on something whose answer is known.
+A phantom is a table of shapes with exactly known intensities: the quickest way to test a mesh, a modulus mapping or a
+simulation against a known answer.
 """
 
 import tempfile
@@ -15,8 +15,8 @@ import pyvista
 import tetopt
 
 # %%
-# Shapes are painted in order, each over those before it. World axes are right, anterior and superior, and the box's
-# centre is 0, 0, 0.
+# Shapes are painted in order, each over the previous ones. World axes are right, anterior and superior; the box is
+# centred at 0, 0, 0.
 
 TABLE = """
 name = "breast"
@@ -57,8 +57,7 @@ with tempfile.TemporaryDirectory() as folder:
     phantom = tetopt.load_phantom(path)
 
 # %%
-# The phantom is rendered as voxels, with the labels on the same grid. With labels the result says which one each cell
-# carries.
+# Render the phantom as voxels, with labels on the same grid. With labels, the result has the label of each cell.
 
 image = phantom.image()
 labels = phantom.label_image()
@@ -66,8 +65,8 @@ result = tetopt.mesh_image(tetopt.content(image, labels), nodes=1200)
 mesh, of_cell = result.mesh, result.labels
 
 # %%
-# The exact volume of the lesion is 4/3 pi a b c. The cells that carry its label have some per cent less, since flat
-# facets cut off what a curved surface bulges out; more nodes cut off less.
+# The exact volume of the lesion is 4/3 pi a b c. The cells with its label have a few per cent less, since flat facets
+# cut off part of a curved surface; more nodes reduce this.
 
 fields = tetopt.cell_fields(mesh, image)
 exact_mm3 = 4.0 / 3.0 * np.pi * 8 * 6 * 6
@@ -75,7 +74,7 @@ volume_mm3 = fields["volume"][of_cell == 2].sum()
 print(f"lesion: {volume_mm3:.1f} mm3 of cells, {exact_mm3:.0f} mm3 exactly")
 
 # %%
-# The gland is cut open, with the lesion and the cyst whole in it.
+# The gland, cut open, with the complete lesion and cyst.
 
 grid = mesh.to_pyvista({"label": of_cell})
 front = grid.clip("-y", origin=(0, 0, 0), crinkle=True)

@@ -1,9 +1,9 @@
 """
-Linear or quadratic cells
-=========================
+Compare linear and quadratic elements
+=====================================
 
-The same mesh is solved with linear and with quadratic displacements. Quadratic cells have more unknowns, and for the
-same number of unknowns they are much nearer to the truth.
+Solve the same mesh with linear and with quadratic displacements. Quadratic elements have more unknowns, but are much
+more accurate for the same number of unknowns.
 """
 
 import matplotlib.pyplot as plt
@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import tetopt
 
 # %%
-# A gland with two stiff nodules, whose intensities are Young's moduli in kPa. The top is held and the bottom pushed in
-# by 1 % of the height. In 2-D this is plane stress.
+# A gland with two stiff nodules; intensities are Young's moduli in kPa. The top is fixed, and the bottom is pushed in
+# by 1 % of the height. In 2-D, this is plane stress.
 
 image = tetopt.load_phantom("prostate_2d").image()
 
@@ -24,8 +24,8 @@ def solution(mesh, order):
 
 
 # %%
-# The truth that errors are measured against is a fine mesh with quadratic cells. The energy of a compression falls
-# towards it from above, so that the error of the energy is a fair one to compare by.
+# The reference solution is a fine mesh with quadratic elements. The strain energy of a compression converges to it from
+# above, so its error is a fair comparison.
 
 fine = tetopt.mesh_image(image, nodes=3000).mesh
 exact = solution(fine, order=2).strain_energy
@@ -43,13 +43,13 @@ for order in (1, 2):
     print(f"order {order}: error of the energy {row} unknowns")
 
 # %%
-# On the coarsest mesh quadratic cells are better by this factor.
+# On the coarsest mesh, quadratic elements are more accurate by this factor.
 
 factor = errors[1][0] / errors[2][0]
 print(f"{nodes[0]} nodes: the error of quadratic cells is {factor:.2f} times smaller")
 
 # %%
-# The curves, and the stress that quadratic cells find on the mesh of 480 nodes.
+# The errors, and the stress of quadratic elements on the mesh of 480 nodes.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.8), layout="constrained")
 for order, name, colour in ((1, "linear", "#2f6db5"), (2, "quadratic", "#d95f02")):

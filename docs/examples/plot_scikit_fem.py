@@ -1,9 +1,9 @@
 """
-A solver in ten lines: scikit-fem
-=================================
+Solve with scikit-fem in ten lines
+==================================
 
-``model.to_skfem()`` hands the mesh to scikit-fem with its sets by name, and the moduli of the cells go along as an
-array. Linear elasticity is then ten lines, and the energy is the one that tetopt's own solver finds.
+``model.to_skfem()`` passes the mesh with its named sets to scikit-fem; the moduli of the elements are an array. Linear
+elasticity then takes ten lines, and the energy equals that of tetopt's solver.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 import tetopt
 
 # %%
-# A stiff sphere in a soft cube. The cube's bottom is held, and its top is moved down by 3 mm and to the side by 6 mm.
+# A stiff sphere in a soft cube. The bottom is fixed; the top moves down by 3 mm and to the side by 6 mm.
 
 image = tetopt.load_phantom("sphere").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=900).mesh
 model = tetopt.build_model(mesh, image, young="h", nu=0.4, loads=["hold:inferior", "move:superior:6,0,-3"])
 
 # %%
-# Boundaries have the names of the model's sets, and cells keep their order, so that the materials fit as they are.
+# Boundaries have the names of the model's sets. Cells keep their order, so the materials match.
 
 skmesh = model.to_skfem()
 basis = skfem.Basis(skmesh, skfem.ElementVector(skfem.ElementTetP1()), intorder=1)
@@ -44,7 +44,7 @@ ours = tetopt.solve(model).strain_energy
 print(f"strain energy {energy:.2f} uJ by scikit-fem, {ours:.2f} uJ by tetopt")
 
 # %%
-# The sphere turns in the sheared cube, and keeps its shape. Colours are the length of the displacement.
+# The sphere rotates in the sheared cube and keeps its shape. Colours show the magnitude of the displacement.
 
 displacement = u[basis.nodal_dofs].T
 length = np.linalg.norm(displacement, axis=1)

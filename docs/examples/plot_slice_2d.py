@@ -1,9 +1,9 @@
 """
-A slice in two dimensions: the paper's Fig. 2
-=============================================
+Reproduce the paper's Fig. 2 in 2-D
+===================================
 
-A criss-cross lattice is moved onto three inclusions, first for the shape of its cells alone, then with the image. The
-paper shows this on a phantom of its own in its Fig. 2.
+Fit a criss-cross lattice to three inclusions, first by cell shape alone, then with the image. Fig. 2 of the paper shows
+this on another phantom.
 """
 
 import matplotlib.pyplot as plt
@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import tetopt
 
 # %%
-# ``tetopt.lattice_mesh`` makes the uniform mesh of the paper, and ``tetopt.optimize_paper`` is its scheme: nodes move
-# down E and are connected anew in the first iterations.
+# ``tetopt.lattice_mesh`` makes the paper's uniform mesh. ``tetopt.optimize_paper`` is its scheme: nodes move to lower E
+# and are reconnected in the first iterations.
 
 image = tetopt.load_phantom("fig2_2d").image(voxel_mm=1.0)
 start = tetopt.lattice_mesh(image, spacing=5.0)
@@ -20,12 +20,12 @@ shape_alone = tetopt.optimize_paper(image, start, k_D=0.0, iterations=15).mesh
 aligned = tetopt.optimize_paper(image, start, k_D=0.5, iterations=15).mesh
 
 # %%
-# Without the image, optimising the shape leaves as much variance in the cells as there was. With it, most of it goes,
-# at the same number of nodes.
+# Optimising shape alone leaves the variance inside the cells unchanged. With the image, most of it disappears, with the
+# same number of nodes.
 
 
 def fraction(mesh):
-    """Part of the image's variance that is left inside the cells."""
+    """Fraction of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
@@ -34,7 +34,7 @@ left_of_lattice = fraction(aligned) / fraction(start)
 print(f"the aligned mesh leaves {left_of_lattice:.3f} of what the lattice leaves")
 
 # %%
-# The image through the three meshes.
+# The image on the three meshes.
 
 figure, axes = plt.subplots(1, 3, figsize=(12, 4.4), layout="constrained")
 meshes = {"lattice": start, "shape alone, k_D = 0": shape_alone, "with the image, k_D = 0.5": aligned}

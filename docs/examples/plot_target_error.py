@@ -1,9 +1,9 @@
 """
-As many nodes as an error takes
-===============================
+Mesh to a target error
+======================
 
-Instead of a number of nodes, a run can be given the fraction of the image's variance that may be left inside the cells.
-It takes the nodes that this needs.
+Instead of a number of nodes, set the fraction of the image's variance that may remain inside the cells. tetopt finds
+the number of nodes.
 """
 
 import matplotlib.pyplot as plt
@@ -13,18 +13,18 @@ from nilearn.datasets import load_mni152_template
 import tetopt
 
 # %%
-# An axial slice of MNI152, which is quick. All of it works the same in 3-D.
+# An axial slice of MNI152, to save time; 3-D works the same way.
 
 template = load_mni152_template(resolution=1)
 k = 90
 image = tetopt.Image(template.get_fdata()[:, :, k], template.affine[np.ix_([0, 1, 3], [0, 1, 3])])
 
 # %%
-# First the error against the number of nodes, each mesh from its own octree (in 2-D a quadtree).
+# First, the error as a function of the number of nodes, each mesh from its own octree (in 2-D, a quadtree).
 
 
 def fraction(mesh):
-    """Part of the image's variance that is left inside the cells."""
+    """Fraction of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
@@ -34,14 +34,14 @@ for number, error in zip(numbers, errors, strict=True):
     print(f"{number:5} nodes leave {error:.4f}")
 
 # %%
-# Then the other way around. The result's ``nodes`` is the number that it took.
+# Then the inverse. The result's ``nodes`` is the number that was needed.
 
 result = tetopt.mesh_image(image, target_error=0.03)
 needed = result.nodes
 print(f"{needed} nodes leave {fraction(result.mesh):.4f}, 0.03 at most as was asked for")
 
 # %%
-# The mesh that leaves 0.03, and where it lies on the curve.
+# The mesh with an error of 0.03, and its place on the curve.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5), layout="constrained", width_ratios=[1, 1.1])
 means = tetopt.cell_moments(image, result.mesh).mean

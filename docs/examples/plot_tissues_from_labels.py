@@ -1,9 +1,9 @@
 """
-Tissues from labels
-===================
+Mesh tissues from labels
+========================
 
-Where labels exist, each of them joins the image energy: cells fall on one tissue, and the surfaces between tissues are
-whole, manifold and smooth. The labels here are grey and white matter of MNI152.
+Each label contributes to the image energy: cells lie in one tissue, and surfaces between tissues are complete, manifold
+and smooth. The labels here are grey and white matter of MNI152.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ from nilearn.datasets import load_mni152_gm_template, load_mni152_template, load
 import tetopt
 
 # %%
-# nilearn's wheel has the probabilities of grey and white matter beside the T1. The likeliest tissue of each voxel of
-# the brain is its label: 1 is fluid and what else there is, 2 grey, 3 white matter.
+# nilearn's wheel has probabilities of grey and white matter for the T1. Label each brain voxel with its most likely
+# tissue: 1 is fluid and everything else, 2 grey matter, 3 white matter.
 
 load = (load_mni152_template, load_mni152_gm_template, load_mni152_wm_template)
 t1, grey, white = (of_tissue(resolution=1).get_fdata()[::3, ::3, ::3] for of_tissue in load)
@@ -25,7 +25,7 @@ labels = tetopt.Image(np.where(t1 > 0, tissue, 0), affine)
 mask = tetopt.Image(1.0 * (t1 > 0), affine)
 
 # %%
-# The result has the label of each cell. Without a mask the space around the brain is meshed as well, with label 0.
+# The result has the label of each cell. Without a mask, the space around the brain is meshed, too, with label 0.
 
 result = tetopt.mesh_image(tetopt.content(image, labels, mask), nodes=2500)
 dices = {row.label: row.dice for row in tetopt.label_fidelity(labels, result.mesh, result.labels)}
@@ -33,10 +33,10 @@ grey_dice, white_dice = dices[2], dices[3]
 print(f"Dice of grey matter {grey_dice:.4f}, of white matter {white_dice:.4f}")
 
 # %%
-# Dice compares the voxels in the cells of a label with the voxels that have it. It is the number to watch when you
-# change the nodes: grey matter is a sheet of one or two voxels here, and with few nodes a good part of it is lost.
+# Dice compares the voxels in the cells of a label with the voxels of that label. Watch it when you change the number of
+# nodes: grey matter is a sheet of one or two voxels here, and with few nodes much of it is lost.
 #
-# The brain without its upper third, each cell in the colour of its tissue.
+# The brain without its upper third, cells coloured by tissue.
 
 grid = result.mesh.to_pyvista({"label": result.labels})
 half = grid.clip("z", origin=(0.0, 0.0, 14.0), crinkle=True)

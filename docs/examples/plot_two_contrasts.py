@@ -1,9 +1,9 @@
 """
-Two contrasts
-=============
+Mesh two contrasts
+==================
 
-Some structures show in one contrast alone. A mesh of two contrasts keeps to what either of them shows, and a weight
-says how much each counts.
+Some structures are visible in only one contrast. A mesh of two contrasts follows both; weights set how much each
+counts.
 """
 
 import matplotlib.pyplot as plt
@@ -12,8 +12,8 @@ import numpy as np
 import tetopt
 
 # %%
-# Two contrasts of one phantom on the same voxels. The disc and the ellipse show in the first alone, the box in the
-# second alone. A contrast on other voxels comes onto the first's by ``tetopt.resample_contrast``.
+# Two contrasts of one phantom on the same voxels. The disc and the ellipse are visible only in the first, the box only
+# in the second. For a contrast on another grid, use ``tetopt.resample_contrast``.
 
 labels = tetopt.load_phantom("fig2_2d").label_image()
 shape = labels.data.astype(int)
@@ -21,8 +21,8 @@ first = tetopt.Image(np.array([100, 200, 20, 100])[shape], labels.affine)
 second = tetopt.Image(np.array([0.5, 0.5, 0.5, 0.9])[shape], labels.affine)
 
 # %%
-# Three meshes of 250 nodes: of the first contrast, of the second, and of both. Contrasts count by their own variance,
-# so that their scales do not matter; ``weights=[1, 0.5]`` would halve the second.
+# Three meshes of 250 nodes: of the first contrast, of the second, and of both. Contrasts are normalised by their
+# variance, so their scales do not matter; ``weights=[1, 0.5]`` would halve the second.
 
 meshes = {
     "of the first": tetopt.mesh_image(first, nodes=250).mesh,
@@ -32,7 +32,7 @@ meshes = {
 
 
 def fraction(image, mesh):
-    """Part of the image's variance that is left inside the cells."""
+    """Fraction of the image's variance that is left inside the cells."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
@@ -42,14 +42,14 @@ for name, mesh in meshes.items():
     )
 
 # %%
-# The mesh of both is nearly as good for each contrast as the mesh of that one, and much better for the other.
+# For each contrast, the mesh of both is nearly as good as the mesh of that contrast, and much better for the other.
 
 both = meshes["of both"]
 worst = max(fraction(first, both), fraction(second, both))
 print(f"at most {worst:.4f} is left of either contrast")
 
 # %%
-# Above the cells with the mean of the first contrast, below with that of the second.
+# Cell means of the first contrast (top) and the second (bottom).
 
 figure, axes = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")
 for column, (name, mesh) in zip(axes.T, meshes.items(), strict=True):

@@ -1,9 +1,9 @@
 """
-The ventricles of MNI152
-========================
+Extract the ventricles of MNI152
+================================
 
-The middle of a brain is meshed without a segmentation, and then the largest connected set of dark cells is taken out:
-these are the ventricles, as a closed surface and as a set that a solver knows by name.
+Mesh the middle of a brain without a segmentation and extract the largest connected set of dark cells: the ventricles,
+as a closed surface and as a named set for a solver.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ from nilearn.datasets import load_mni152_template
 import tetopt
 
 # %%
-# nilearn's wheel carries the MNI152 T1. Every second voxel is enough here, of a box around the ventricles; the affine
-# that belongs to them moves the origin to the first voxel that is taken.
+# nilearn's wheel has the MNI152 T1. Every second voxel of a box around the ventricles is enough here. The affine moves
+# the origin to the first voxel of the box.
 
 template = load_mni152_template(resolution=1)
 step, first, last = 2, (56, 92, 76), (142, 178, 116)
@@ -26,8 +26,8 @@ image = tetopt.Image(template.get_fdata()[box], affine)
 mesh = tetopt.mesh_image(image, nodes=3000).mesh
 
 # %%
-# ``below:0.6`` names the largest set of cells that hang together and whose mean is below 0.6 (white matter has
-# 0.85, fluid 0.25). Its facets are a set, too, so that loads can name it, such as ``pressure:ventricles:1.5``.
+# ``below:0.6`` selects the largest connected set of cells with a mean below 0.6 (white matter has 0.85, fluid 0.25).
+# Its facets are a set, too, for loads such as ``pressure:ventricles:1.5``.
 
 model = tetopt.build_model(mesh, image, sets=["ventricles=below:0.6"])
 chosen = model.sets.cells["ventricles"]
@@ -35,8 +35,8 @@ volume_ml = tetopt.cell_fields(mesh, image)["volume"][chosen].sum() / 1000.0
 print(f"{len(chosen)} cells, {volume_ml:.2f} ml")
 
 # %%
-# The boundary of these cells is closed, and ``tetopt.save_surface`` writes it as STL or PLY. It is drawn in front of
-# the image's own slices.
+# The boundary of these cells is closed; ``tetopt.save_surface`` writes it as STL or PLY. Here it is drawn in front of
+# image slices.
 
 surface = tetopt.extract_surface(mesh.points, mesh.cells, chosen)
 ventricles = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
