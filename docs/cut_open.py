@@ -111,3 +111,7 @@ def photograph(draw: Draw) -> NDArray[np.uint8]:
     is_drawn = (pixels < 255).any(axis=2)
     rows, columns = (np.flatnonzero(is_drawn.any(axis=axis)) for axis in (1, 0))
     return pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
