@@ -85,7 +85,7 @@ def test_a_folder_that_takes_no_file_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["m" * 252 + ".vtu", "m\0.vtu"])
 def test_a_name_that_cannot_be_is_refused(tmp_path, name):
-    assert_refused(tmp_path / name, "cannot be written: (File name too long|embedded null)")
+    assert_refused(tmp_path / name, "cannot be written: (File name too long|.*embedded null)")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes in folders")

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
+from inspect import cleandoc
 from numbers import Integral, Real
 from pathlib import Path
 from textwrap import wrap
@@ -146,7 +147,7 @@ def _parameters() -> str:
                 re.sub(r"\w+://\S*\w", r"``\g<0>``", option.text), 108, initial_indent="    ", subsequent_indent="    "
             ),
         ]
-    return "\n    ".join(lines)
+    return "\n".join(lines)
 
 
 def _kind_words(kind: Any) -> str:
@@ -157,8 +158,8 @@ def _kind_words(kind: Any) -> str:
     return f"list of {_kind_words(get_args(own)[0])}" if get_origin(own) is list else own.__name__.lower()
 
 
-if Job.__doc__:
-    Job.__doc__ = Job.__doc__.replace("PARAMETERS", _parameters())
+if Job.__doc__:  # of which Python takes the indentation off from 3.13 on
+    Job.__doc__ = cleandoc(Job.__doc__).replace("PARAMETERS", _parameters())
 
 
 def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 from importlib import metadata
 
-REQUIREMENT = re.compile(r"(?P<name>[\w.-]+) *(?P<versions>[^;\[]*?) *; *extra *== *['\"](?P<extra>[\w.-]+)['\"]")
+# A line of the metadata: "name>=1.0; extra == 'itk'", or with a condition on Python before the extra.
+REQUIREMENT = re.compile(
+    r"(?P<name>[\w.-]+) *(?P<versions>[^;\[]*?) *;(?:[^;]+ and)? *extra *== *['\"](?P<extra>[\w.-]+)['\"]"
+)
 
 
 def install_hint(extra: str, *packages: str) -> str:
