@@ -51,6 +51,22 @@ def test_each_bound_of_a_package_is_one():
     assert [(name, versions) for name, versions in bounds.items() if len(versions) > 1] == []
 
 
+def test_the_recipe_for_conda_says_what_the_project_says():
+    recipe = yaml.safe_load((ROOT / "docs" / "develop" / "recipe.yaml").read_text(encoding="utf-8"))
+    project = PROJECT["project"]
+    run = recipe["requirements"]["run"]
+    assert run[0] == "python >=${{ python_min }}"
+    assert [each.replace(" ", "").replace("_", "-") for each in run[1:]] == project["dependencies"]
+    assert project["requires-python"] == f">={recipe['context']['python_min']}"
+    assert recipe["context"]["version"] == tetopt.__version__
+    assert recipe["about"]["license"] == project["license"]
+    assert recipe["about"]["summary"] == project["description"]
+    entries = dict(each.split(" = ") for each in recipe["build"]["python"]["entry_points"])
+    assert entries == project["scripts"]
+    built = [each.replace(" ", "") for each in recipe["requirements"]["host"][2:]]
+    assert built == PROJECT["build-system"]["requires"]
+
+
 def test_the_archive_of_sources_has_what_git_has():
     """Each file of the repository is in one of the archive's folders, or is there without being named."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
