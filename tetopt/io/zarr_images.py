@@ -277,6 +277,8 @@ def _node(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what else lies in the folder
+            # From 3.4 on zarr reads chunks of no voxels as chunks of one, with a warning.
+            warnings.filterwarnings("error", message="(?s).*stored chunk shape .* is invalid")
             return zarr.open(zarr.storage.LocalStore(path, read_only=True), mode="r", use_consolidated=False)
     except Exception as error:  # zarr raises whatever comes up at damaged metadata; a codec that is missing is named
         raise InputError(f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again") from error
