@@ -66,7 +66,7 @@ def test_a_cohort_from_python_is_that_of_the_command(small):
     events = []
     tetopt.run_cohort(small / "t.tsv", str(small / "out"), on=events.append, **one, dry_run=True)
     assert events[-1] == ("note", "1 subject: 1 done; 0 to run", None)
-    with pytest.raises(InputError, match="has no option 'noodes'; is nodes meant"):
+    with pytest.raises(InputError, match="unknown option 'noodes'; did you mean nodes"):
         tetopt.run_cohort(small / "t.tsv", small / "out", noodes=3)
     with pytest.raises(InputError, match=r"^`nodes`: expected a whole number, got 'many'"):
         tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")
@@ -90,7 +90,7 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     assert {name: row["status"] for name, row in rows.items()} == {
         "sub-01": "done", "sub-02": "failed", "sub-03": "failed"
     }  # fmt: skip
-    assert "taken to the image's voxels" in (small / "out" / "logs" / "sub-01.log").read_text()
+    assert "resampled to the image's grid" in (small / "out" / "logs" / "sub-01.log").read_text()
     for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
         reason = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())["reason"]
         assert file in rows[name]["reason"] == reason in (small / "out" / "logs" / f"{name}.log").read_text()
@@ -149,7 +149,7 @@ def test_ctrl_c_keeps_what_is_done_and_a_rerun_does_the_rest_though_a_worker_die
     assert run.wait(WAIT_SECONDS) == 130
     words, first = (small / "words.txt").read_text(), meshes(small)
     assert 1 <= len(first) < 5
-    assert "to go on" in words
+    assert "to run only" in words
     assert "Traceback" not in words
     assert {path.name for path in (small / "out" / ".work").iterdir()} == {"lock", "tetopt-manifest"}
     run = begun(small)
@@ -180,14 +180,14 @@ def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
     said = refused(small, capsys)
     places = [int(number) for line in said for number in re.findall(r"^tetopt: \S+t\.tsv, line (\d+): ", line)]
     assert sorted(places) == [2, 3, 4, 5, 6, 7, 8]
-    assert any("nods" in line and "is nodes meant?" in line for line in said)
+    assert any("nods" in line and "did you mean nodes?" in line for line in said)
 
 
 @pytest.mark.parametrize(("options", "words"), [
     (("--threads", "0"), "--threads: expected 1 or more"),
     (("--format", "docx"), "--format: expected one of"),
     (("--mask", "m-{subject}.nii"), "m-01.nii is not there"), (("--participant-label", "9"), "has no subject 9"),
-    (("--mask", "a.nii.gz", "--background", "3"), "give one of them"),
+    (("--mask", "a.nii.gz", "--background", "3"), "give only one of them"),
 ])  # fmt: skip
 def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, options, words):
     monkeypatch.chdir(small)
@@ -258,7 +258,7 @@ def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
     assert "there is no {sub}; write {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
     (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
     (line,) = refused(small, capsys)
-    assert 'nodes: "many" is no value of it; k-d: "0,9" is no value of it; write 0.9' in line
+    assert 'nodes: invalid value "many"; k-d: invalid value "0,9"; write 0.9' in line
 
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
@@ -287,8 +287,8 @@ def test_the_table_of_what_would_be_run(small, capsys):
 def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--dry-run") == 0
     words = capsys.readouterr().out
-    assert re.search(r"sub-01: \d+ s on a thread, \d+ MB|sub-01: \d+ s on a thread, 0\.\d+ GB", words)
-    assert "in all" in words
+    assert re.search(r"sub-01: \d+ s on one thread, \d+ MB|sub-01: \d+ s on one thread, 0\.\d+ GB", words)
+    assert "in total" in words
     assert not (small / "out").exists()
 
 

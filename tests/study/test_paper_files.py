@@ -124,7 +124,7 @@ def test_paper_refuses(tmp_path, capsys):
     tetopt.save_image(tmp_path / "small.nii", small)
     inputs = ["--image", str(tmp_path / "head.nii"), "--labels", str(tmp_path / "small.nii")]
     assert main(["paper", "-o", str(tmp_path / "o"), *inputs]) == 2
-    assert "expected labels on the image's own voxels" in capsys.readouterr().err
+    assert "expected labels on the image's grid" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 

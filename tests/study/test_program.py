@@ -181,7 +181,7 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     finally:
         command.kill()
     assert command.returncode == 143
-    assert "--resume goes on from there" in said
+    assert "continue with --resume" in said
     assert not is_running(int(pid_file.read_text()))
     wait_for(lambda: not list(temporary.iterdir()), 10.0)
     assert (tmp_path / "out" / "runs" / "bcc-150-1.json").is_file()
