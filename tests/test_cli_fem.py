@@ -171,7 +171,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{mesh}", "--young", "1=2,*=1", "--load", "compress:5%"], "the mesh has no labels; give the label image"),
         (["{model}", "--labels", "half.nii"], "half.nii: labels must be whole numbers from 0"),
         (["{model}", "--labels", "plane.nii"], "plane.nii: expected 3-D labels like the mesh, got a 2-D image"),
-        (["{model}", "--average", "gauss"], "--average: averages over an image's voxels; pass the IMAGE before the MESH"),
+        (["{model}", "--average", "gauss"], "--average: averages over an image's voxels; pass the IMAGE"),
         (["{model}", "--young", "3"], "gravity: the cells have no density; give --density"),
         (["{model}", "--load", "hold:inferor"], "did you mean inferior?"),
         (["{model}", "--load", "pressure:left:1"], "mesh: nothing holds it, neither a displacement nor a spring"),
