@@ -155,4 +155,4 @@ def test_a_cohort_finds_those_of_each_subject(folder):
 def test_a_missing_tissue_of_a_cohort_is_named_before_it_runs(folder, capfd):
     (folder / "s.tsv").write_text("subject\timage\ttissues\n1\ta.nii.gz\tgrey.nii.gz,gone.nii.gz\n")
     assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out") == 2
-    assert "gone.nii.gz is not there" in capfd.readouterr().err
+    assert "gone.nii.gz does not exist" in capfd.readouterr().err

@@ -89,7 +89,7 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
     with pytest.raises(Problems) as caught:
         bids_subjects(folder, participants=["1", "2", "8", "9"])
     message = str(caught.value)
-    assert "sub-2/anat/sub-3_T1w.nii.gz: its name is not that of an image in sub-2" in message
+    assert "sub-2/anat/sub-3_T1w.nii.gz: the name does not match its folder sub-2" in message
     assert [line for line in caught.value.lines if "no image" in line] == [
         f"{folder}: sub-{label}: no image _T1w" for label in (2, 8, 9)
     ]
@@ -145,7 +145,7 @@ def test_folders_that_are_none(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["", "T1w.nii.gz", "acq-_T1w", "sub-01_T1w", ".*", "T1w\n"])
 def test_suffixes_that_are_none(tmp_path, suffix):
-    with pytest.raises(InputError, match="expected what a BIDS name ends in") as caught:
+    with pytest.raises(InputError, match="expected the end of a BIDS name") as caught:
         bids_subjects(filled(tmp_path / "raw"), suffix)
     assert str(caught.value).isprintable()
 
@@ -157,7 +157,7 @@ def test_names_that_are_no_text_are_no_images(tmp_path):
     assert len(bids_subjects(folder)) == 1
     odd = tmp_path / os.fsdecode(b"\xff")
     shutil.copytree(folder, odd)
-    with pytest.raises(InputError, match="cannot be looked through"):
+    with pytest.raises(InputError, match="cannot be searched"):
         bids_subjects(odd)
 
 

@@ -129,7 +129,7 @@ def test_a_subject_that_does_not_fit_does_not_begin(play, tmp_path):
     assert {each.key: each.status for each in ended} == {"sub-a": "done", "sub-b": "failed", "sub-c": "done"}
     record = failure(tmp_path, "sub-b")
     assert record["attempts"] == 0
-    assert "is predicted to take 1 GB of memory" in record["reason"]
+    assert "needs 1 GB of memory (predicted)" in record["reason"]
 
 
 def test_where_there_is_no_worker_it_waits_and_where_there_are_more_it_uses_them(play, monkeypatch):

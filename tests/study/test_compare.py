@@ -225,7 +225,7 @@ def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
     assert by_k_D[0]["E_D_fraction"] > by_k_D[-1]["E_D_fraction"]
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert np.asarray(PIL.Image.open(out / "tradeoff.png").convert("L")).std() > 20.0
-    assert "What tetopt&#39;s options trade" in (out / "report.html").read_text()
+    assert "Trade-offs of tetopt&#39;s options" in (out / "report.html").read_text()
     assert main(["compare", *words, "--pipelines", "bcc", "--force"]) == 0
     assert not (out / "tradeoff.png").exists()
     assert "Trade-offs" not in (out / "report.html").read_text()
