@@ -57,7 +57,7 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
     assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
     assert subjects[2].files == subjects[2].options == {}
     assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
-    with pytest.warns(UserWarning, match=r"left out, without _T1w in ses-b: 1 \(sub-02\)"):
+    with pytest.warns(UserWarning, match=r"left out subjects without _T1w in ses-b: 1 \(sub-02\)"):
         chosen = bids_subjects(folder, sessions=["ses-b"])
     assert rows(chosen, folder) == [("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii")]
 
@@ -76,7 +76,7 @@ def test_entities_choose_among_several(tmp_path):
     assert "run-01_T1w.nii.gz, sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz" in message
     assert "`suffix` acq-mprage_run-01_T1w" in message
     assert "sub-2" not in message  # of two images that without entities is what T1w says
-    with pytest.warns(UserWarning, match=r"left out, without _run-2_T1w: 1 \(sub-2\)"):
+    with pytest.warns(UserWarning, match=r"left out subjects without _run-2_T1w: 1 \(sub-2\)"):
         chosen = bids_subjects(folder, "run-2_T1w")
     assert rows(chosen, folder) == [("1", "", "sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz")]
     assert rows(bids_subjects(folder, "rec-norm_T1w", ["2"]), folder)[0][2] == "sub-2/anat/sub-2_rec-norm_T1w.nii.gz"
@@ -129,7 +129,7 @@ def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatc
 def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         bids_subjects(tmp_path / "none")
-    with pytest.raises(InputError, match=r"with a dataset_description\.json; or give a table"):
+    with pytest.raises(InputError, match=r"with a dataset_description\.json, or a table"):
         bids_subjects(tmp_path)
     file = tmp_path / "dataset_description.json"
     file.write_text('{"a":')
@@ -139,7 +139,7 @@ def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="a table in JSON, got list"):
         bids_subjects(tmp_path)
     file.write_text("{}")
-    with pytest.raises(InputError, match=r"no image _T1w\.nii\.gz of any subject; `suffix`"):
+    with pytest.raises(InputError, match=r"no subject has an image _T1w\.nii\.gz; use `suffix`"):
         bids_subjects(tmp_path)
 
 

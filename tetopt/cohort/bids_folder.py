@@ -212,7 +212,7 @@ def _warn_of_others(folder: Path, what: str, subjects: set[str]) -> None:
     others = sorted(path.name for path in folder.glob("sub-*") if path.is_dir() and path.name[4:] not in subjects)
     if others:
         some = ", ".join(others[:NAMED_SUBJECTS]) + (", ..." if len(others) > NAMED_SUBJECTS else "")
-        warn(f"{_shown(folder)}: left out {len(others)} subjects without {plain(what)} ({plain(some)})")
+        warn(f"{_shown(folder)}: left out subjects without {plain(what)}: {len(others)} ({plain(some)})")
 
 
 def _subject(scan: Scan, folder: Path) -> Subject:
