@@ -599,7 +599,7 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     [
         ([], "one of --below, --label, --set, --boundary, --interface"),
         (["--below", "-3"], "no cell has a mean below -3"),
-        (["--label", "7"], "no cell has label 7; there are 0, 1"),
+        (["--label", "7"], "no cell has label 7; the mesh has 0, 1"),
         (["--set", "skin"], 'no cell set "skin"; it has label_0, label_1'),
         (["--label", "1", "--space", "x"], "expected ras or lps"),
         (["--interfaces"], "STL cannot store the labels of triangles; use .ply or .vtp or .vtk"),

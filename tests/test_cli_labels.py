@@ -162,7 +162,7 @@ def test_what_is_refused(folder, tmp_path, capsys):
     said = refused(capsys, "convert", folder / "plain.vtu", out, "--young", "liver=5,*=20")
     assert "no label has a name; give a table of them (--label-names)" in said
     said = refused(capsys, "surface", mesh, "-o", tmp_path / "a.stl", "--label", "spleen")
-    assert "no cell has label 9 (spleen); there are 0 (soft tissue), 1 (bright/ball [é])" in said
+    assert "no cell has label 9 (spleen); the mesh has 0 (soft tissue), 1 (bright/ball [é])" in said
     said = refused(capsys, "convert", mesh, out, "--young", "5", "--load", "hold:interface_soft_tissue_bright_ball")
     assert f"did you mean {INTERFACE}?" in said
     other = "hold:interface_bright_ball_e_soft_tissue"

@@ -95,7 +95,7 @@ def test_bytes_and_other_grids_are_told(folder, capsys):
     assert exit_code(*words(folder, "--tissues", both(folder))) == 0
     said = capsys.readouterr().err
     assert "grey.nii.gz: resampled to the image's grid (linear)\n" in said
-    assert "white.nii.gz: taken" not in said
+    assert "white.nii.gz: resampled" not in said
 
 
 def test_the_image_may_be_one_of_them(folder, capsys):
@@ -108,7 +108,7 @@ def test_what_cannot_be(folder, capfd):
     def refused(match, *more):
         assert_refused(capfd, words(folder, *more), match)
 
-    refused("--labels and --tissues: give one", "--labels", folder / "l.nii.gz", "--tissues", both(folder))
+    refused("--labels and --tissues: give only one", "--labels", folder / "l.nii.gz", "--tissues", both(folder))
     refused("--merge: needs --labels", "--tissues", both(folder), "--merge", "aseg")
     refused("--label-weight: needs --labels", "--label-weight", "2")
     refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},{folder / 'grey.nii.gz'}")

@@ -238,7 +238,7 @@ def test_a_worker_that_runs_several_tasks_in_one_process_is_refused(tmp_path):
     answers["tcp://good:1"] = good
     assert newcomers.slots() == 1
     answers["tcp://bad:1"] = good._replace(n_bytes=3.4 * GB)
-    with pytest.raises(InputError, match=r"has 2.83 GB for each of 1 tasks, the largest needs about 3 GB"):
+    with pytest.raises(InputError, match=r"has 2.83 GB for each of 1 tasks, but the largest needs about 3 GB"):
         newcomers.slots()
     answers["tcp://bad:1"] = good._replace(n_threads=4)
     with pytest.raises(InputError, match=r"runs one task at a time, got 4; .* --nthreads 1 --nworkers 4"):

@@ -107,7 +107,7 @@ def test_what_a_worker_takes_with_it_is_run_once_more_and_first(play, tmp_path, 
 
 
 @pytest.mark.parametrize(("end", "words"), [
-    (killed(), "its worker ended, 2 times"), ("cancelled", "the worker that ran it ended, 2 times"),
+    (killed(), "its worker ended, 2 times"), ("cancelled", "its worker ended, 2 times"),
     (ValueError("first\nlast\x1b[2J"), "ValueError: first last"),
 ])  # fmt: skip
 def test_what_fails_twice_is_a_row(play, tmp_path, end, words):

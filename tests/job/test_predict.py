@@ -45,7 +45,7 @@ def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
     assert exit_code(*words) == 0
     lines = capsys.readouterr().out.replace("\n", " ")
     assert "s on 1 thread, in nine of ten cases" in lines
-    assert "MB of memory at its peak" in lines or "GB of memory at peak" in lines
+    assert "MB of memory at peak" in lines or "GB of memory at peak" in lines
     assert sorted(tmp_path.rglob("*")) == before
     monkeypatch.setattr(cli_predict, "calibrated_speed", lambda: 1e-3)
     monkeypatch.setattr(cli_predict, "available_bytes", lambda: 1000)

@@ -430,7 +430,7 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
         (["--pipelines", "tetopt,gmsh"], "pipelines: expected some of"),
         (["--pipelines", ""], "pipelines: expected some of"),
         (["--pipelines", "bcc,bcc"], "each once"),
-        (["--curve", "a"], "--curve: expected parts"),
+        (["--curve", "a"], "--curve: expected fractions"),
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),
         (["--max-seconds", "nan"], "--max-seconds: expected more than 0"),

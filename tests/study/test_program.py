@@ -197,8 +197,8 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
         ("a=sh {image}", "expected {output}, and {image}"),
         ("a=sh {image} {output} {seed}", "got {seed}"),
         ("a=sh {image} {output}.stl", "must be named .vtu, .vtk, .vtkhdf, .msh, .msh2, got {output}.stl"),
-        ("a=tetopt-no-such-program {image} {output}", 'no program "tetopt-no-such-program"'),
-        ("tetopt=sh {image} {output}", 'a pipeline named "tetopt" already'),
+        ("a=tetopt-no-such-program {image} {output}", 'no executable program "tetopt-no-such-program"'),
+        ("tetopt=sh {image} {output}", 'expected unique names, got "tetopt" again'),
     ],
 )
 def test_bad_commands(text, words, tmp_path, capsys):
