@@ -154,7 +154,7 @@ def test_the_table_reads_back(cohort, tmp_path):
     about = json.loads(path.with_suffix(".json").read_text())
     assert list(about) == list(rows[0])
     assert about["labels.17.volume"] == {
-        "Description": "Label 17 (hippocampus): volume of these voxels", "Units": "mm^3"
+        "Description": "Label 17 (hippocampus): volume of its voxels", "Units": "mm^3"
     }  # fmt: skip
 
 

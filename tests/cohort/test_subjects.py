@@ -57,7 +57,7 @@ def test_tables_as_programs_write_them(tmp_path, suffix, lines):
 
 @pytest.mark.parametrize(("lines", "words"), [
     (["subject,file"], "missing image"), (["subject,image,image"], "occurs 2 times"),
-    (["subject,image"], "a line for each subject"), ([""], "an empty file"), (['subject,image', '"a,b'], "correct that"),
+    (["subject,image"], "a line for each subject"), ([""], "an empty file"), (['subject,image', '"a,b'], "correct"),
 ])  # fmt: skip
 def test_what_is_no_table_is_refused(tmp_path, lines, words):
     with pytest.raises(InputError, match=words):
