@@ -804,7 +804,7 @@ def test_quality_with_another_image(tmp_path, inputs, capsys):
     assert exit_code("quality", tmp_path / "a.vtu", "--image", inputs / "sphere.nii.gz") == 0
     assert capsys.readouterr().err == ""
     assert exit_code("quality", tmp_path / "a.vtu", "--image", tmp_path / "other.nii") == 0
-    assert "a.vtu was built from another image" in capsys.readouterr().err
+    assert "a.vtu was built from a different image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", [["--slice", "k=4"], ["--crop", "1:7,:,2:"]])

@@ -100,12 +100,12 @@ def test_groups_may_list_names_of_the_table(folder):
 def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
     assert exit_code(*words(folder, "--merge", "white=2,41; blood=9; rest=*")) == 0
     assert "warning: --merge:" in (said := capsys.readouterr().err)
-    assert "has no label in blood" in said
+    assert "has no label for blood" in said
     labels = tetopt.load_image(folder / "l.nii.gz")
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(np.where(labels.data > 500, 511, labels.data)))
     assert exit_code(*words(folder, "--merge", "synthseg")) == 0
     assert "1 into 5 (soft)" in (said := capsys.readouterr().err)
-    assert "has no label in" not in said
+    assert "has no label for" not in said
 
 
 def test_what_cannot_be_merged(folder, capsys):

@@ -124,7 +124,7 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, whole, monkeypatch, capfd):
     # A file that comes during the run stays.
     monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
-    assert "a.vtu.work was not removed, as it contains other files than tetopt's: note.txt" in capfd.readouterr().err
+    assert "a.vtu.work was not removed, as it contains foreign files: note.txt" in capfd.readouterr().err
     assert content(folder) == {"note.txt": b"mine"}
     loaded = load_mesh(tmp_path / "a.vtu")
     assert np.array_equal(loaded.mesh.points, whole[0].mesh.points)

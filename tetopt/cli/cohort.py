@@ -68,7 +68,7 @@ def _say_estimate(plan: CohortPlan) -> None:
     peak = max((one.peak_bytes for one in estimate.values()), default=0.0)
     whole = f"in total {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
-        out.print(f"{whole}; divided by the number of simultaneous subjects" if to_run else "nothing to run")
+        out.print(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
     out.print(f"{whole}; on this machine {n_workers} at a time: about {time_words(seconds / n_workers)}")

@@ -226,7 +226,7 @@ def _scalar(value: Any) -> Value:
 
 
 def _put_grid(columns: dict[str, Value], box: Any) -> None:
-    """Add the image's orientation, obliqueness, spacing and shape."""
+    """Add the image's orientation, obliquity, spacing and shape."""
     try:
         affine = np.array(box["affine"], dtype=np.float64)
         shape = [int(each) for each in box["shape"]]

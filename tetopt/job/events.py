@@ -25,7 +25,7 @@ class Stage(NamedTuple):
 
 
 class Event(NamedTuple):
-    """A report of a run.
+    """An event of a run.
 
     Parameters
     ----------

@@ -266,6 +266,6 @@ def end_parts(mesh: Path, result: MeshingResult) -> None:
     folder = work_folder(mesh)
     if result.ended in ("iterations", "converged"):
         if left := removed(folder):
-            warning(f"{folder} was not removed, as it contains other files than tetopt's: {', '.join(left)}")
+            warning(f"{folder} was not removed, as it contains foreign files: {', '.join(left)}")
     else:
         note(f"{folder}: run the same command again with `force` to continue, or remove it")

@@ -253,7 +253,7 @@ def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> 
     made_from = loaded.text("image_sha256")
     is_other = made_from is not None and made_from != sha256(image_path)
     if is_other:
-        warning(f"{mesh_path} was built from another image than {image_path}")
+        warning(f"{mesh_path} was built from a different image, not {image_path}")
     return is_other
 
 

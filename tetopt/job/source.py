@@ -206,7 +206,7 @@ def _merged(
             raise InputError(f"{options.labels}: {error}") from error
         missing = [name for label, name in merged.names.items() if label not in merged.numbers.values()]
         if missing and not is_preset(options.merge):
-            warning(f"`merge`: {options.labels} has no label in {listed(missing)}")
+            warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
         note(f"merged labels: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
         return merged.labels, LabelTable(merged.names, {}), merged.numbers
