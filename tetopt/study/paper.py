@@ -195,7 +195,7 @@ def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        A strain is not finite, or the floor is not above 0.
+        A strain is not finite, or `floor` is not above 0.
 
     Examples
     --------
