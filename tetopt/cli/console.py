@@ -100,7 +100,7 @@ out = _Console(highlight=False, soft_wrap=True, emoji=False)
 
 
 def open_streams() -> None:
-    """Put the null device where standard input, output or error is closed.
+    """Open the null device in place of closed standard input, output or error.
 
     Otherwise the next file that is opened takes their number and receives the libraries' output.
     """

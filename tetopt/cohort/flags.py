@@ -34,7 +34,7 @@ Side = Literal["both", "above", "below"]
 
 
 class Flag(NamedTuple):
-    """One odd thing about a subject."""
+    """A flag of a subject."""
 
     column: str  # from `tetopt.cohort.numbers`, or "violated", "label", "duplicate"
     words: str  # the reason, on one line

@@ -57,7 +57,7 @@ class Row(NamedTuple):
     key: str  # "sub-01_ses-a"
     subject: str  # "sub-01"
     session: str  # "ses-a", or ""
-    # violated: a mesh, but a requirement is violated; missing: expected, and neither a mesh nor a failure
+    # violated: the mesh violates a requirement; missing: expected, with neither a mesh nor a failure
     status: Status
     reason: str  # failure or violated requirements, on one line; "" for a subject that is done
     violated: tuple[str, ...]  # the names of these requirements

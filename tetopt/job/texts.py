@@ -27,7 +27,7 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
     """Return the options with some values replaced by texts, by names of the command line.
 
     A switch is on by "1", "true" or "yes" and off by "0", "false" or "no"; several values of an option that may be
-    repeated stand between semicolons.
+    repeated are separated by semicolons.
 
     Raises
     ------

@@ -35,7 +35,7 @@ class Settings(NamedTuple):
     average: str = DEFAULT_AVERAGE  # of a cell's moduli, in addition to Eq. (2)'s mean
     reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
     reference_seconds: float = 120.0  # time limit of the reference without `reference_dofs`, for all of `nus`
-    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
+    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, over `nodes`, in addition to 1
     tradeoff: bool = False  # whether tetopt's options are swept around its defaults
     max_seconds: float = 3600.0  # of one run of a pipeline
     max_bytes: int | None = None  # of one run, resident
@@ -133,7 +133,7 @@ class Measurement(NamedTuple):
 
 
 class PipelineRun(NamedTuple):
-    """One execution of a pipeline that ended with a mesh; also the median, lowest or highest of several, by number."""
+    """One execution of a pipeline that gave a mesh; also the median, lowest or highest of several, by number."""
 
     seconds: dict[str, float]  # by step
     seconds_total: float
@@ -162,7 +162,7 @@ class PipelineResult(NamedTuple):
     about: str
     failure: str | None  # the first, if a run failed
     reason: str | None  # of it, as `tetopt.study.child.Reason`
-    crashes: list[str]  # of all runs; each was run once more
+    crashes: list[str]  # of all runs; each run was repeated once
     notes: list[str]
     runs: list[PipelineRun]
     median: PipelineRun | None = None  # None if no run gave a mesh, as for the next two

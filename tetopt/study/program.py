@@ -215,10 +215,10 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
         return mesh, every, []
     if distance > NEAR_BOX_VOXELS:
         return mesh, every, [f"its boundary lies up to {distance:.3g} voxels from the sides of the image's box"]
-    # Stretched onto the box first, which inverts no cell: a mesh of padded labels is too wide by half a voxel.
+    # Stretched onto the box first, which inverts no cell: a mesh of padded labels is half a voxel too wide.
     low, high = index.min(axis=0), index.max(axis=0)
     index = sides[:, 0] + (index - low) * (sides[:, 1] - sides[:, 0]) / (high - low)
-    # Nodes meant to be on a side may lie under flat cells, which hide them from `put_on_box`.
+    # Nodes that belong on a side may lie under flat cells, where `put_on_box` does not find them.
     for side in (0, 1):
         index = np.where(np.abs(index - sides[:, side]) <= ROUGH_SIDE_VOXELS, sides[:, side], index)
     is_flat = np.any(np.all(is_on_sides(index, sides, 0.0)[mesh.cells], axis=1), axis=(1, 2))

@@ -4,13 +4,13 @@ One factor scales the sizing field and, with its 8th power, the envelope: if the
 requested, only a wider envelope helps. Measurements behind the choices, with E_D as a fraction of the image's variance:
 
 - MNI T1, 4 classes, 5000 nodes. With an envelope of 1.35 mm, edges of 13, 25 and 49 mm give 16,755, 15,951 and 15,635
-  nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); as it is now (3.2 mm,
+  nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); currently (3.2 mm,
   triangles of 9.4 mm), 5090 nodes: 0.0312, mean rho 0.248, smallest angle 12.9 degrees, 173 s for 3 runs on a busy
   two-core machine.
 - Sphere phantom, 1500 nodes, fixed envelope: 0.0093 uniform and 0.0092 with the sizing field at 0.13 mm, 0.0149 and
-  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. As it is now: 0.0103. By hand it can be a tenth better. Two
-  spheres, as it is now: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
-- The soup, not `tetrahedralize_csg`: the latter takes no sizing field, and needs 5566 nodes for the sphere at 0.0100,
+  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. Currently: 0.0103, which tuning by hand can reduce by a
+  tenth. Two spheres, currently: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
+- The soup, not `tetrahedralize_csg`, which accepts no sizing field, and needs 5566 nodes for the sphere at 0.0100,
   where the soup has 0.0103 with 1499.
 """
 
