@@ -234,8 +234,8 @@ def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, input
     first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["octree", "optimised"]
     assert table["E, combined"] == ["1.0000", f"{numbers['energies']['E']:.4f}"]
-    assert table["E_D, of initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
-    assert table["E_G, of initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
+    assert table["E_D, relative to initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
+    assert table["E_G, relative to initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
     assert table["rho, smallest"] == [f"{first['min_rho']:.4f}", f"{last['min_rho']:.4f}"]
     assert table["smallest angle, degrees"] == [f"{first['min_dihedral']:.2f}", f"{last['min_dihedral']:.2f}"]
     assert table["rho, smallest"][0] != table["rho, smallest"][1]
@@ -385,8 +385,8 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines()[-3:] == [
-        "interrupted: finishing the current nodes, then writing the mesh (again to give up)",
-        "interrupted again: what is not yet written is given up",
+        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to discard it)",
+        "interrupted again: unwritten results are discarded",
         "ended by Ctrl-C; written: nothing",
     ]
     assert list(tmp_path.iterdir()) == []
@@ -541,8 +541,8 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 6, "What is meshed": 13, "Number and size of cells": 9, "The mesh it begins with": 4,
-        "Optimisation": 11, "Beyond one memory": 5, "For the solver": 13,
+        "Options": 6, "Region and labels": 13, "Number and size of cells": 9, "Initial mesh": 4,
+        "Optimisation": 11, "Meshing in parts": 5, "For the solver": 13,
     }  # fmt: skip
 
 
@@ -804,7 +804,7 @@ def test_quality_with_another_image(tmp_path, inputs, capsys):
     assert exit_code("quality", tmp_path / "a.vtu", "--image", inputs / "sphere.nii.gz") == 0
     assert capsys.readouterr().err == ""
     assert exit_code("quality", tmp_path / "a.vtu", "--image", tmp_path / "other.nii") == 0
-    assert "a.vtu was made from another image" in capsys.readouterr().err
+    assert "a.vtu was built from a different image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", [["--slice", "k=4"], ["--crop", "1:7,:,2:"]])
@@ -836,7 +836,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     ("extra", "words"),
     [
         (["--method", "paper"], "only with --method fast"),
-        (["--spacing", "3"], "no one spacing"),
+        (["--spacing", "3"], "no single spacing"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
@@ -876,7 +876,7 @@ def test_octree_mesh(tmp_path, inputs, capsys):
 )
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
-    assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
+    assert_refused(capfd, command, f"{option.split()[0]}: needs a graded mesh")
 
 
 def test_mesh_with_limits(tmp_path, inputs, capfd):
@@ -970,7 +970,7 @@ def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
     other = tetopt.load_phantom("sphere").label_image(voxel_mm=3.3)
     tetopt.save_image(tmp_path / "other.nii", other)
     assert exit_code(*command, "--truth", tmp_path / "other.nii") == 2
-    assert "expected labels on the image's own voxels" in capfd.readouterr().err
+    assert "expected labels on the image's grid" in capfd.readouterr().err
     assert exit_code(*command, "--classes", "300") == 2
     assert "classes: 300 asked for" in capfd.readouterr().err
     assert not (tmp_path / "l.nii").exists()
@@ -1011,5 +1011,5 @@ def test_an_error_of_a_million_letters_is_cut(capsys):
 def test_a_former_name_is_refused_with_that_of_now(former, now, capsys):
     words = ["mesh", "a.nii", "-o", "a.vtu", "--" + former.replace("_", "-"), "9"]
     assert (exit_code(*words), f"(Possible options: --{now.replace('_', '-')})" in capsys.readouterr().err) == (2, True)
-    with pytest.raises(tetopt.InputError, match=f"has no option '{former}'; is {now} meant"):
+    with pytest.raises(tetopt.InputError, match=f"unknown option '{former}'; did you mean {now}"):
         tetopt.Job.from_json(json.dumps({former: 9}))

@@ -160,7 +160,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     exit_code(*words, "--max-gb", "0.001")
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["ended"] == "max_gb"
-    assert "no more memory is allowed: the mesh so far is kept" in capsys.readouterr().err
+    assert "memory limit reached: the mesh so far is kept" in capsys.readouterr().err
     tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
 
 
@@ -209,7 +209,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
 
     def make(say):
         say("compiling the kernels, 1 of 57")
-        assert lines == ["compiling the kernels, 1 of 57 (of the first run only), 0 s"]
+        assert lines == ["compiling the kernels, 1 of 57 (first run only), 0 s"]
 
     rows = [IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
 
@@ -243,4 +243,4 @@ def test_warm_up_tells_how_compiling_goes(monkeypatch, capsys):
     monkeypatch.setattr(warm_up, "link", link)
     with pytest.raises(InterruptedError):
         warm_up.warm_up_command()
-    assert "compiling the kernels, 1 of 2 (of the first run only)" in capsys.readouterr().err
+    assert "compiling the kernels, 1 of 2 (first run only)" in capsys.readouterr().err

@@ -36,7 +36,7 @@ def test_a_folder_is_new_empty_or_a_cohorts(out, tmp_path):
 )
 def test_a_folder_of_something_else_is_refused(tmp_path, text):
     (tmp_path / "dataset_description.json").write_text(text)
-    with pytest.raises(InputError, match="no cohort's"):
+    with pytest.raises(InputError, match="not a cohort folder"):
         check_out(tmp_path)
 
 
