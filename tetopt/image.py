@@ -104,7 +104,7 @@ class Image:
         """
         shape = tuple(int(size) for size in voxels.shape)
         if len(shape) != 3 or 0 in shape:
-            raise InputError(f"image: expected three axes with a voxel at least, got shape {shape}")
+            raise InputError(f"image: expected three non-empty axes, got shape {shape}")
         image = cls.__new__(cls)
         vars(image).update(voxels=voxels, affine=checked_affine(np.eye(4) if affine is None else affine, 3))
         return image
@@ -112,7 +112,7 @@ class Image:
     @cached_property
     def data(self) -> NDArray[np.floating]:
         """All intensities, as of `Image(data)`; those of a stored image are read when first asked for, and kept."""
-        check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read boxes of it")
+        check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read it box by box")
         whole = _checked_data(self.read((0,) * self.ndim, self.shape))
         vars(self).update(voxels=whole)  # boxes are read from it from now on
         return whole
@@ -343,9 +343,9 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
         raise InputError(f"image data: expected an array of numbers, got {type(data).__name__} ({error})") from error
     check_kind(data.dtype)
     if data.ndim not in (2, 3):
-        raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; pick one volume or slice")
+        raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; select one volume or slice")
     if 0 in data.shape:
-        raise InputError(f"image data: every axis needs a voxel, got shape {data.shape}")
+        raise InputError(f"image data: expected at least one voxel along every axis, got shape {data.shape}")
     is_bad = ~np.isfinite(data)
     if is_bad.any():
         check_finite(int(np.count_nonzero(is_bad)), tuple(int(i) for i in np.argwhere(is_bad)[0]))
@@ -358,15 +358,15 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
 def check_in_memory(image: Image, what: str, remedy: str) -> None:
     """InputError unless the voxels are in memory: `what` needs them there; `remedy` says what does not."""
     if image.is_stored:
-        raise InputError(f"{what} of an image in memory, and this one is stored; {remedy}")
+        raise InputError(f"{what} of an image in memory, but this image is stored; {remedy}")
 
 
 def check_kind(dtype: np.dtype) -> None:
     """InputError unless the voxels are real numbers."""
     if dtype.names is not None or dtype.kind == "O":
-        raise InputError(f"image data: expected one number a voxel, got {dtype}; convert RGB to grey first")
+        raise InputError(f"image data: expected one number per voxel, got {dtype}; convert RGB to grey first")
     if dtype.kind == "c":
-        raise InputError("image data: expected real numbers, got complex ones; take the magnitude first")
+        raise InputError("image data: expected real numbers, got complex ones; compute the magnitude first")
     if dtype.kind not in "buif":
         raise InputError(f"image data: expected numbers, got dtype {dtype}")
 
@@ -375,8 +375,8 @@ def check_finite(n_bad: int, first: tuple[int, ...]) -> None:
     """InputError if there are voxels without a number, the first of them at this index."""
     if n_bad > 0:
         raise InputError(
-            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them (for example "
-            "by the background's value) first"
+            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them first, for "
+            "example by the background's value"
         )
 
 
@@ -385,8 +385,8 @@ def check_intensities(low: float, high: float) -> None:
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
-            f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares "
-            f"overflow or vanish, got {low:g} to {high:g}; scale them"
+            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as their squares "
+            f"would overflow or vanish, got {low:g} to {high:g}; rescale them"
         )
 
 
@@ -409,9 +409,9 @@ def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     if affine.shape != (n + 1, n + 1):
         raise InputError(f"affine: expected shape ({n + 1}, {n + 1}) for {n}-D data, got {affine.shape}")
     if not np.isfinite(affine).all():
-        raise InputError(f"affine: every entry must be finite, got {affine.tolist()}")
+        raise InputError(f"affine: expected finite entries, got {affine.tolist()}")
     if not np.array_equal(affine[-1], np.eye(n + 1)[-1]):
-        raise InputError(f"affine: the last row must be {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
+        raise InputError(f"affine: expected the last row {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
     columns = affine[:-1, :-1]
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(columns, axis=0)
@@ -420,7 +420,7 @@ def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < SINGULAR_DETERMINANT:
         raise InputError(
             f"affine: it is singular (voxel axes of lengths {lengths.tolist()} mm do not span {n}-D space); "
-            "mend the file's header"
+            "correct the file's header"
         )
     _check_extents(columns, lengths, affine[:-1, -1])
     affine.setflags(write=False)
@@ -432,18 +432,18 @@ def _check_extents(columns: NDArray[np.float64], lengths: NDArray[np.float64], o
     least, most = LENGTH_RANGE
     if lengths.min() < least:
         raise InputError(
-            f"affine: expected voxels of {least:g} to {most:g} mm, got {lengths.tolist()} mm; mend the file's header"
+            f"affine: expected voxels of {least:g} to {most:g} mm, got {lengths.tolist()} mm; correct the file's header"
         )
     extents = np.linalg.svd(columns, compute_uv=False)
     if extents[0] > MOST_ASPECT * extents[-1]:
         raise InputError(
             f"affine: expected voxels at most {MOST_ASPECT:g} times as long as thick, got {extents[0]:.4g} mm by "
-            f"{extents[-1]:.4g} mm (edges of {lengths.tolist()} mm); mend the file's header, or resample it"
+            f"{extents[-1]:.4g} mm (edges of {lengths.tolist()} mm); correct the file's header, or resample the image"
         )
     if np.abs(origin).max() > MOST_OFFSET * lengths.min():
         raise InputError(
             f"affine: expected the first voxel within {MOST_OFFSET:g} voxels of the world's origin, got "
-            f"{origin.tolist()} mm; mend the file's header"
+            f"{origin.tolist()} mm; correct the file's header"
         )
 
 

@@ -66,7 +66,7 @@ class Mesh:
             points = np.array(points, dtype=np.float64, order="C")
             cells = np.asarray(cells)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"mesh: expected arrays of numbers, points and cells ({error})") from error
+            raise InputError(f"mesh: expected arrays of numbers for points and cells ({error})") from error
         if points.ndim != 2 or points.shape[1] not in (2, 3):
             raise InputError(f"mesh points: expected shape (N, 2) or (N, 3), got {points.shape}")
         n = points.shape[1]
@@ -77,15 +77,15 @@ class Mesh:
         cells = np.array(cells, dtype=np.int64, order="C")
         if not np.isfinite(points).all():
             first = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise InputError(f"mesh points: every coordinate must be finite, node {first} is {points[first].tolist()}")
+            raise InputError(f"mesh points: expected finite coordinates, but node {first} is {points[first].tolist()}")
         if cells.min() < 0 or cells.max() >= len(points):
-            raise InputError(f"mesh cells: indices must lie in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
+            raise InputError(f"mesh cells: expected indices in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
         v = volumes(points, cells)
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)
             raise InputError(
                 f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, the first are {bad[:5].tolist()}; "
-                "orient them or mend the mesh"
+                "orient them or repair the mesh"
             )
         points.setflags(write=False)
         cells.setflags(write=False)
@@ -353,7 +353,7 @@ class Mesh:
         (True, 0.166667)
         """
         if self.ndim != 3:
-            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary are edges")
+            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary consists of edges")
         from tetopt.geometry.topology import boundary_facets
 
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
@@ -367,7 +367,7 @@ def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -
     expected = (len(numbered_edges(cells)[0]), n)
     if places.shape != expected or not np.isfinite(places).all():
         raise InputError(
-            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, a row for each edge, got {places.shape}"
+            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, one row per edge, got {places.shape}"
         )
     places.setflags(write=False)
     return places

@@ -152,7 +152,7 @@ def test_nodes_follow_from_sizes():
     in_all = tetopt.mesh_image(image, sizes=sizes, iterations=4, order=2).nodes
     assert in_all == pytest.approx(7.2 * result.nodes, rel=1e-3)
     for sizes in (Sizes(longest=6.0), Sizes(field=half_sized(image, 6.0))):
-        with pytest.raises(tetopt.InputError, match="give a number of nodes or a target_error"):
+        with pytest.raises(tetopt.InputError, match="give exactly one of nodes and target_error"):
             tetopt.mesh_image(image, sizes=sizes)
 
 
@@ -294,8 +294,8 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
         (Sizes(longest=0.3), "500 nodes are too few .* they need"),
         (Sizes(smallest=5.0, edge_size=4.0), "edge_size: 4 mm is below the smallest size, 5 mm"),
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
-        (Sizes(field=tetopt.Image(np.ones((4, 4)))), "field: expected one in 3-D"),
-        (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "field: no voxel is above 0"),
+        (Sizes(field=tetopt.Image(np.ones((4, 4)))), "field: expected a 3-D field"),
+        (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "field: expected lengths above 0 mm"),
         (Sizes(smallest=100.0), "smallest: 100 mm is longer than the box, 30 mm"),
         (Sizes(edge_size=1e-6), "500 nodes are too few .* they need"),
         (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
@@ -400,7 +400,7 @@ def test_target_error_within_limits():
     ("image", "arguments", "words"),
     [
         (ball(30, 30, 30), {}, "one of them"),
-        (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "one of them"),
+        (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "exactly one of"),
         (ball(30, 30, 30), {"target_error": 1.0}, "expected a fraction of the image's variance, 0 to 1"),
         (ball(30, 30, 30), {"target_error": float("nan")}, "expected a fraction"),
         (tetopt.Image(np.ones((30, 30, 30))), {"target_error": 0.1}, "the image is constant"),

@@ -180,7 +180,7 @@ def test_voxels_that_no_image_takes(data, words, monkeypatch):
 @pytest.mark.parametrize("sizes", [tetopt.Sizes(edge_size=5.0), tetopt.Sizes(field=tetopt.Image(np.ones((2, 2, 2))))])
 def test_targets_take_voxels_in_memory(sizes):
     voxels = Recorded(noisy((12, 12, 12), np.uint8))
-    with pytest.raises(tetopt.InputError, match=r"largest and field .* this one is stored; use smallest, longest"):
+    with pytest.raises(tetopt.InputError, match=r"largest and field .* this image is stored; use smallest, longest"):
         octree_mesh(tetopt.Image.stored(voxels), 100, sizes)
     assert voxels.reads == []
 

@@ -62,7 +62,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     inside = _mask_values(name, mask.data)
     moved = _moved(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
-        raise InputError(f"{name}: nothing of the mask lies in the image's box; {_both_boxes(mask, image)}")
+        raise InputError(f"{name}: the mask lies outside the image's box; {_both_boxes(mask, image)}")
     return Image(moved, image.affine)
 
 
@@ -106,8 +106,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
     if moved.min() == top:
         raise InputError(
-            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; there is nothing to tell "
-            "apart, leave it out or take another file"
+            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit it or use another file"
         )
     return Image(moved, image.affine)
 
@@ -203,10 +202,10 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
     if level is None:
         raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = image.range
-    outcome = "every voxel is foreground" if fraction > 0.5 else "nothing is left"
+    outcome = "every voxel is foreground" if fraction > 0.5 else "no voxel is foreground"
     raise InputError(
-        f"`background` {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
-        f"holds {low:g} to {high:g}"
+        f"`background` {limit:g}: {outcome}; choose a level between the background's and the tissue's values (the "
+        f"image ranges from {low:g} to {high:g})"
     )
 
 
@@ -233,25 +232,25 @@ def background_level(image: Image) -> float:
     values = _on_faces(data)
     dark = values[values <= threshold].astype(np.float64)
     if len(dark) == 0:
-        raise _no_background(f"no voxel on the faces of the box is among the dark ones, up to {threshold:.4g}")
+        raise _no_background(f"no voxel on the faces of the box is dark ({threshold:.4g} or less)")
     middle = np.median(dark)
     level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
     if level >= threshold:
         raise _no_background(
-            f"the dark voxels on the faces of the box spread up to {level:.4g}, not under the {threshold:.4g} that "
-            "parts dark from bright"
+            f"the dark voxels on the faces of the box range up to {level:.4g}, which is not below the threshold "
+            f"between dark and bright, {threshold:.4g}"
         )
     return level
 
 
 def _no_background(reason: str) -> InputError:
-    return InputError(f"`background` auto: no background found, {reason}; give a value, or leave it out")
+    return InputError(f"`background` auto: no background found, as {reason}; give a value or omit `background`")
 
 
 def _check_axes(name: str, other: Image, image: Image) -> None:
     if other.ndim != image.ndim:
         raise InputError(
-            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; pick one "
+            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; select one "
             "volume or slice"
         )
 
@@ -267,7 +266,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
         raise InputError(
             f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
-            f"{values[0]:g} to {values[-1]:g} ({some}); write the one that you mean as 0 and 1 first"
+            f"{values[0]:g} to {values[-1]:g} ({some}); convert it to 0 and 1 first"
         )
     if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"

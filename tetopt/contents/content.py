@@ -261,11 +261,9 @@ def content(
         number, codes = _one_hot(labels.data.astype(np.int64), region)
         codes = np.sqrt(label_weight) * codes
         if len(codes) == 0:
-            raise InputError(
-                "labels: the same everywhere in what is meshed, there is nothing to tell apart; leave them out"
-            )
+            raise InputError("labels: expected two or more labels in the meshed region, got one; omit them")
     if len(contrasts) + len(codes) == 0:
-        raise InputError("weights: nothing that differs between voxels counts; give one above 0")
+        raise InputError("weights: every image or label that varies has weight 0; give at least one a weight above 0")
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(
@@ -326,7 +324,7 @@ def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> l
     if tissues is None:
         return []
     if labels is not None:
-        raise InputError("labels and tissues: give one of them")
+        raise InputError("labels and tissues: expected at most one of them, got both")
     check_tissues(tissues)
     warn_of_sums(tissues)
     return list(tissues)
@@ -354,7 +352,7 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     """
     inside = mask.data >= INSIDE_FRACTION
     if not inside.any():
-        raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
+        raise InputError("mask: expected voxels of 0.5 or more, got none")
     box = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
     ends = ((max(s.start - MARGIN_VOXELS, 0), s.stop + MARGIN_VOXELS) for s in box)
     part = tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True))
@@ -412,13 +410,11 @@ def _check(
     for name, image in named:
         if image.shape != first.shape:
             raise InputError(
-                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.resample_mask and the like"
+                f"{name}: expected shape {first.shape} like the first, got {image.shape}; see tetopt.resample_mask"
             )
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
-            raise InputError(
-                f"{name}: expected voxels in the same place as the first image's; see tetopt.resample_mask"
-            )
+            raise InputError(f"{name}: expected the same voxel grid as the first image's; see tetopt.resample_mask")
     check_weights(len(images), weights, label_weight, smooth_interfaces)
     if others["labels"] is not None:
         check_labels("labels", others["labels"])

@@ -23,7 +23,7 @@ from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
 PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
-NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then
+NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # what to do then
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
 FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
 FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
@@ -106,9 +106,9 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
     raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
     n_voxels = labels.data.size * prod(factors)
-    what = f"labels: {len(values)} of them on {n_voxels} voxels"
+    what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:
-        what += f", which are divided by {' x '.join(map(str, factors))}"
+        what += f" (after division by {' x '.join(map(str, factors))})"
     check_memory(PARTITION_BYTES * n_voxels, what, NO_ROOM)
     off = np.zeros(labels.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
@@ -146,7 +146,7 @@ def gathered(
         Voxels to one of the labels'.
     """
     channel = label_channels(start, len(values))
-    what = f"labels: {len(values)} of them on {start.size} voxels"
+    what = f"labels: {len(values)} labels on {start.size} voxels"
     check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * start.size, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)

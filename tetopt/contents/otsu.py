@@ -44,7 +44,7 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     is_filled = counts > 0
     if is_filled.sum() < classes:
         raise InputError(
-            f"classes: {classes} asked for, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
+            f"classes: {classes} requested, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
         )
     centres = 0.5 * (edges[1:] + edges[:-1])[is_filled]
     counts = counts[is_filled].astype(np.float64)
@@ -72,8 +72,8 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # as numpy's bins are
     if low < high and not (steps[:-1] < steps[1:]).all():
         raise InputError(
-            f"classes: expected intensities that {HISTOGRAM_BINS} bins can part, got {low} to {high}; subtract what "
-            "all of them have"
+            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} to {high}; subtract the "
+            "offset common to all"
         )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
     fraction = np.cumsum(counts) / counts.sum()

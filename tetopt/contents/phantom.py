@@ -396,7 +396,7 @@ class Phantom:
                 f"give {self.ndim} world coordinates in mm for each"
             )
         if not np.isfinite(checked).all():
-            raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; leave those out")
+            raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; remove those points")
         return checked
 
     def _top_shape(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -417,7 +417,7 @@ class Phantom:
             power = MAX_PHANTOM_VOXELS.bit_length() - 1
             raise InputError(
                 f"{where}: voxel_mm: expected at most 2**{power} voxels, got "
-                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; take larger ones"
+                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; use larger ones"
             )
         linear = self.axes.T * (self.size_mm / counts)
         affine = np.eye(self.ndim + 1)
@@ -432,7 +432,7 @@ class Phantom:
     def _check_whole(self, shape: tuple[int, ...]) -> None:
         """InputError unless so many voxels fit into memory, with what is made of them."""
         what = f"phantom {self.name!r}: {' x '.join(map(str, shape))} voxels"
-        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "take larger ones, or write it as .zarr")
+        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels, or write it as .zarr")
 
     def _voxel_means(
         self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
@@ -612,14 +612,14 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     if isinstance(name_or_path, str) and path.suffix != ".toml":
         if name_or_path not in phantom_names():
             raise InputError(
-                f"phantom {name_or_path!r}: no such phantom; give one of {', '.join(phantom_names())}, "
+                f"phantom {name_or_path!r}: no such phantom; use one of {', '.join(phantom_names())}, "
                 "or the path of a .toml file"
             )
         path = phantom_folder() / f"{name_or_path}.toml"
     try:
         table = toml_of(path, "phantom's file")
     except InputError as error:
-        known = f"; or give one of the names {', '.join(phantom_names())}" if not path.exists() else ""
+        known = f"; or use one of the names {', '.join(phantom_names())}" if not path.exists() else ""
         raise InputError(f"phantom {error}{known}") from error
     return _phantom(table, f"phantom {path}")
 
@@ -636,12 +636,12 @@ def _phantom(table: dict[str, Any], where: str) -> Phantom:
     if not isinstance(background, dict):
         raise InputError(
             f"{where}: background: expected a table, got {background!r}; "
-            "write for example background = { intensity = 20, label = 0 }"
+            "for example: background = { intensity = 20, label = 0 }"
         )
     _check_keys(background, ("intensity",), ("label",), f"{where}: background")
     shapes = table.get("shape", [])
     if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
-        raise InputError(f"{where}: shape: expected tables, got {shapes!r}; begin each shape with [[shape]]")
+        raise InputError(f"{where}: shape: expected tables, got {shapes!r}; start each shape with [[shape]]")
     return Phantom(
         name=_text(table["name"], f"{where}: name"),
         description=_text(table["description"], f"{where}: description"),
@@ -670,7 +670,7 @@ def _shape(table: dict[str, Any], n: int, where: str) -> Shape:
     if kind == "layer":
         normal = _numbers(table["normal"], n, f"{where}: normal")
         if not normal.any():
-            raise InputError(f"{where}: normal: expected a direction, got all zeros; give one non-zero entry")
+            raise InputError(f"{where}: normal: expected a direction, got all zeros; make at least one entry non-zero")
         frame = _unit(normal)[None]
         center = frame[0] * _number(table["offset_mm"], f"{where}: offset_mm")
         thickness = np.array([_number(table["thickness_mm"], f"{where}: thickness_mm")])
@@ -704,7 +704,7 @@ def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):  # a row of zeros becomes NaN, and with it the determinant
         axes = np.array([_unit(_numbers(row, n, f"{what}: row {i}")) for i, row in enumerate(rows, start=1)])
     if not abs(np.linalg.det(axes)) >= SINGULAR_DETERMINANT:
-        raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them independent")
+        raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them linearly independent")
     axes.setflags(write=False)
     return axes
 
@@ -722,7 +722,7 @@ def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDA
     if (voxel > size_mm).any():
         raise InputError(
             f"{what}: expected voxels no larger than the box of {size_mm.tolist()} mm, got {voxel.tolist()}; "
-            "take smaller voxels"
+            "use smaller voxels"
         )
     return voxel
 
@@ -751,11 +751,11 @@ def _check_keys(table: dict[str, Any], needed: Iterable[str], optional: Iterable
     """InputError if a needed key is missing or a key is neither needed nor optional."""
     missing = [key for key in needed if key not in table]
     if missing:
-        raise InputError(f"{where}: missing {', '.join(missing)}; every one of {', '.join(needed)} is needed")
+        raise InputError(f"{where}: missing {', '.join(missing)}; {', '.join(needed)} are required")
     unknown = [key for key in table if key not in {*needed, *optional}]
     if unknown:
         raise InputError(
-            f"{where}: unknown {', '.join(map(repr, unknown))}; the keys known here are "
+            f"{where}: unknown {', '.join(map(repr, unknown))}; the keys allowed here are "
             f"{', '.join([*needed, *optional])}"
         )
 
@@ -804,7 +804,7 @@ def _positive(values: NDArray[np.float64], what: str) -> NDArray[np.float64]:
 def _text(value: Any, what: str) -> str:
     """A string that is not empty."""
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{what}: expected a text in quotes, got {value!r}")
+        raise InputError(f"{what}: expected a quoted string, got {value!r}")
     return value
 
 

@@ -70,7 +70,7 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     """
     low, high = tissue.range
     if PERCENT < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
-        warn(f"{name}: whole numbers to {high:g}, taken as probabilities times 255")
+        warn(f"{name}: whole numbers up to {high:g}, read as probabilities times 255")
         tissue = Image(tissue.data / BYTE_SCALE, tissue.affine)
     _check_range(name, tissue)
     return resample_contrast(tissue, image, name)
@@ -111,7 +111,7 @@ def check_tissues(tissues: Sequence[Image]) -> None:
     for number, tissue in enumerate(tissues, 1):
         name = f"tissues, number {number}"
         if tissue.shape != tissues[0].shape:
-            raise InputError(f"{name}: expected shape {tissues[0].shape} as the first, got {tissue.shape}")
+            raise InputError(f"{name}: expected shape {tissues[0].shape} like the first, got {tissue.shape}")
         _check_range(name, tissue)
 
 
@@ -122,8 +122,8 @@ def warn_of_sums(tissues: Sequence[Image]) -> None:
         total += tissue.data
     if n_over := int(np.count_nonzero(total > 1.0 + SUM_TOLERANCE)):
         warn(
-            f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels, to {total.max():.3g} at "
-            "most; they are divided by their sum"
+            f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels (up to {total.max():.3g}); "
+            "they are divided by their sum"
         )
 
 
@@ -155,7 +155,7 @@ def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Me
     values = np.flatnonzero(np.bincount(largest.ravel(), minlength=len(rows)))
     lost = sorted(set(range(1, len(rows))) - set(values.tolist()))
     if lost:
-        warn(f"tissues: in no voxel the most probable: number {', '.join(map(str, lost))}")
+        warn(f"tissues: most probable in no voxel: number {', '.join(map(str, lost))}")
     second = np.partition(rows, -2, axis=0)[-2]
     first = rows.max(axis=0)
 
@@ -172,8 +172,8 @@ def _check_range(name: str, tissue: Image) -> None:
     low, high = tissue.range
     if low < -RANGE_TOLERANCE or high > 1.0 + RANGE_TOLERANCE:
         raise InputError(
-            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; divide by the value that stands for "
-            "1, such as 100 or 255, first"
+            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; first divide by the value that "
+            "stands for 1, such as 100 or 255"
         )
 
 

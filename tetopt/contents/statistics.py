@@ -80,7 +80,7 @@ def statistics(image: Image) -> Statistics:
     check_kind(image.voxels.dtype)
     stride, middles = noise_places(shape)
     n_voxels, need = float(np.prod(shape, dtype=np.float64)), NOISE_PLANE_BYTES * len(middles) * shape[1] * shape[2]
-    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "turn its shortest axis to the last")
+    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "make its shortest axis the last")
     sums, squares = np.empty(shape[:2]), np.empty(shape[:2])
     near = np.empty((3, len(middles), *shape[1:]))
     places = np.unravel_index(np.arange(0, int(n_voxels), stride), shape)

@@ -214,8 +214,8 @@ class Overlap(NamedTuple):
     def __str__(self) -> str:
         """Return the sentence that a message has of it."""
         return (
-            f"cells overlap: {self.n_voxels} voxels lie in several of them; cells {self.cells[0]} and {self.cells[1]} "
-            f"both hold voxel {list(self.voxel)}"
+            f"cells overlap: {self.n_voxels} voxels lie in several cells; cells {self.cells[0]} and {self.cells[1]} "
+            f"both contain voxel {list(self.voxel)}"
         )
 
 
@@ -368,7 +368,7 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     bits = 28 - ceil(log2(reach))
     if bits < 8:
         raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in the same mm?"
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in world mm?"
         )
     return bits
 
@@ -407,7 +407,7 @@ def _check_grid(shape: Sequence[int], n_sums: int) -> None:
     """InputError for prefix sums that there is no memory for: of 64 bits, and once more while they are made."""
     n_voxels = prod(shape)
     what = f"image: {n_sums} sums of {' x '.join(map(str, shape))} voxels"
-    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop it, or mesh it with larger voxels")
+    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop the image, or resample it to larger voxels")
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
@@ -444,7 +444,7 @@ def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np
     if len(wrong):
         raise InputError(
             f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, the first are "
-            f"{wrong[:5].tolist()}; remove or mend them before sampling"
+            f"{wrong[:5].tolist()}; remove or repair them before sampling"
         )
 
 

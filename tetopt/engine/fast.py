@@ -595,4 +595,4 @@ def check_options(
             f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular tetrahedron has 70.5"
         )
     if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
-        raise InputError(f"nodes: expected a whole number above 2, or None to keep those of the mesh, got {nodes!r}")
+        raise InputError(f"nodes: expected a whole number above 2, or None to keep the mesh's nodes, got {nodes!r}")

@@ -185,7 +185,7 @@ class MeshingResult(NamedTuple):
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""
         last, mesh = self.history[-1], self.mesh
-        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is left within cells"
+        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is unexplained"
         rows = [
             ("E", f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations ({self.ended})"),
             ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{fraction}"),

@@ -271,8 +271,8 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
     shape = " x ".join(map(str, content.image.shape))
     what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
-    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or allow more", limit)
-    check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
+    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or raise the memory limit", limit)
+    check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "use fewer nodes", limit)
 
 
 def _with_defaults(mode: Mode, options: dict[str, Any], **stated: Any) -> dict[str, Any]:
@@ -313,21 +313,21 @@ def with_label_sizes(
 def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int) -> None:
     """InputError for a mode that there is not, and for what does not belong to it."""
     if mode not in MODE_DEFAULTS:
-        raise InputError(f"mesh_image: expected a mode of {', '.join(MODE_DEFAULTS)}, got {mode!r}")
+        raise InputError(f"mesh_image: expected mode {', '.join(MODE_DEFAULTS)}, got {mode!r}")
     if order not in (1, 2):
         raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     names = [name for name, value in values.items() if value is not None]
     if unknown := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])
-        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {takes}, but no {unknown[0]}")
+        raise InputError(f"mesh_image: mode {mode!r} takes {takes}, not {unknown[0]}")
     if mode == "graded" and ("nodes" in names) == ("target_error" in names):
-        raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
+        raise InputError("mesh_image: give exactly one of nodes and target_error")
     if mode in ("uniform", "paper") and ("nodes" in names) == ("spacing" in names):
-        raise InputError("mesh_image: give a number of nodes or a spacing, one of them")
+        raise InputError("mesh_image: give exactly one of nodes and spacing")
     if mode == "start" and not names:
-        raise InputError("mesh_image: mode 'start' needs a mesh to start from")
+        raise InputError("mesh_image: mode 'start' requires a mesh to start from")
     if mode == "paper" and not (content.is_plain and content.region is None):
-        raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
+        raise InputError("mesh_image: the paper's scheme takes one image, without labels or mask")
 
 
 def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
@@ -385,12 +385,12 @@ def meshed_to_error(
     content = plain(image)
     variance = content.variance
     if variance == 0.0:
-        raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
+        raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
     noise = content.noise * content.unit / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's fraction, by estimate {noise:.3g}: "
-            "cells would have to follow the noise; ask for more, or denoise the image"
+            f"target_error: {target_error:g} of the variance is below the noise's fraction, estimated as {noise:.3g}, "
+            "so cells would have to follow the noise; use a larger fraction, or denoise the image"
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes

@@ -193,7 +193,7 @@ def _check_fills_box(image: Image, mesh: Mesh) -> None:
     is_box = np.abs(extent - box_sides(image.shape)).max() <= ON_SIDE_VOXELS
     if not is_box or abs(filled_fraction(mesh, image) - 1.0) > 1e-9:
         raise InputError(
-            "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
+            "mesh: re-tessellation requires a mesh that fills the image's box exactly, as a lattice does; "
             'pass retessellate="never" to keep the connectivity'
         )
 

@@ -101,8 +101,9 @@ def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[s
         return {}
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
-    words = f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to {angles.min():.2f}"
-    return {"min_dihedral": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
+    words = f"{below} of {len(angles)} cells have a dihedral angle below {min_dihedral:g} degrees, down to "
+    words += f"{angles.min():.2f}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"
+    return {"min_dihedral": words} if below else {}
 
 
 def requested(result: MeshingResult, content: Content, target_error: float | None, is_filled: bool) -> MeshingResult:
@@ -115,8 +116,8 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
     fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
     if target_error is not None and fraction > target_error:
         violated["error"] = (
-            f"{fraction:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
-            "cells or more iterations, or ask for a number of nodes"
+            f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}; allow smaller "
+            "cells or more iterations, or give a number of nodes"
         )
     violated |= _uncovered(content.image, result) if is_filled else {}
     return result._replace(violated=violated, fraction=fraction)
@@ -126,7 +127,7 @@ def _uncovered(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
-    words = f"the mesh does not cover the image: {outside} voxels are outside, its volume is {volume:.9g} of "
+    words = f"the mesh does not cover the image: {outside} voxels are outside, and its volume is {volume:.9g} of "
     return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
 
 
@@ -135,7 +136,7 @@ def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     gained = result.history[-1].n_voxels - result.history[0].n_voxels
     if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
         return {}
-    words = f"the mesh no longer covers what it did: {gained:+d} voxels, its volume is {volume:.9g} of "
+    words = f"the mesh no longer covers its initial domain: {gained:+d} voxels, and its volume is {volume:.9g} of "
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
@@ -144,13 +145,13 @@ def _violated_mask(image: Image, region: Region, result: MeshingResult) -> dict[
     is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
         violated["overlap"] = (
-            f"cells overlap: together they hold {twice} voxels twice; allow more nodes, and please report this"
+            f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
         )
     dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
         violated["mask"] = (
-            f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
-            "allow more nodes"
+            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large for the mask's "
+            "detail; allow more nodes"
         )
     return violated
 

@@ -35,13 +35,13 @@ def state_of(
     flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
     if len(flat):
         raise InputError(
-            f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
+            f"mesh: {len(flat)} cells are too flat to optimise, the first are {flat[:5].tolist()}; "
             "remove them or move their nodes apart"
         )
     E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
     weight = k_D / squares0 if squares0 > 0.0 else 0.0
     if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
-        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
+        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities in a usual range?")
     geometry, surface = float((1.0 - k_D) / E_G0), float(weight * state.objective.wrong_side)
     return weighted(state, geometry, float(weight), surface)
 

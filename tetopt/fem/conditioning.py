@@ -65,7 +65,7 @@ def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
         An eigenvalue or the solution did not converge.
     """
     if len(system.free) == 0:
-        raise InputError("conditioning: every node is fixed or pushed, so there is nothing to solve; take a finer mesh")
+        raise InputError("conditioning: every node is fixed or pushed, so there is nothing to solve; use a finer mesh")
     largest = lambda_max(system.K_ff)
     smallest = lambda_min(system.K_ff, None if is_direct(system, method) else multigrid(system))
     return Conditioning(largest, smallest, largest / smallest, cg_iterations(system.K_ff, system.load))
@@ -140,7 +140,7 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
         solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
         if failure:
-            raise RuntimeError("conditioning: the smallest eigenvalue did not converge: a solve did not")
+            raise RuntimeError("conditioning: the smallest eigenvalue did not converge, as a solve did not")
         return solution
 
     return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but where moduli differ a lot it comes through

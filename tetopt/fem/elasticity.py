@@ -193,8 +193,8 @@ def _stiffness(
     """
     n_nodes, n = elements.points.shape
     n_cells, n_corners = elements.cells.shape
-    what = f"elasticity: the stiffness of {n_cells} cells of {n_corners} nodes"
-    check_memory(PAIR_BYTES * n_cells * n_corners**2, what, "take a coarser mesh, or cells of order 1")
+    what = f"elasticity: the stiffness of {n_cells} cells with {n_corners} nodes each"
+    check_memory(PAIR_BYTES * n_cells * n_corners**2, what, "use a coarser mesh, or order 1")
     pairs, slot = np.unique(elements.cells[:, :, None] * n_nodes + elements.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
     blocks = np.empty((len(pairs), n, n))
@@ -313,8 +313,8 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.i
     for side, is_there in zip(sides[axis], is_on, strict=True):
         if not is_there.any():
             raise InputError(
-                f"mesh: no node lies on the image's face at index {side:g} of axis {axis}, the mesh runs from "
-                f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, crop and slice?"
+                f"mesh: no node lies on the image's face at index {side:g} of axis {axis}; the mesh extends from "
+                f"{place.min():g} to {place.max():g}, but must fill the image's box: same image, crop and slice?"
             )
     low, high = (np.flatnonzero(is_there) for is_there in (is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]))
     return low, high
@@ -344,11 +344,11 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
         inner = np.flatnonzero(~on_box)
         raise InputError(
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
-            f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is of another image, or crop"
+            f"{outer[inner[0]].tolist()}: it has a crack or several components, or belongs to another image or crop"
         )
     filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-5:
-        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box; they overlap or leave parts out")
+        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box: they overlap or leave gaps")
 
 
 def constrained(
@@ -391,7 +391,7 @@ def constrained(
     is_prescribed, prescribed = np.asarray(is_prescribed, dtype=bool), np.asarray(prescribed, dtype=np.float64)
     for name, array in (("is_prescribed", is_prescribed), ("prescribed", prescribed)):
         if array.shape != elements.points.shape:
-            raise InputError(f"{name}: expected shape {elements.points.shape}, a row a node, got {array.shape}")
+            raise InputError(f"{name}: expected shape {elements.points.shape}, one row per node, got {array.shape}")
     values = np.where(is_prescribed, prescribed, 0.0)
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
@@ -484,7 +484,7 @@ def compression(
     if len(both):
         raise InputError(
             f"fixed_nodes and pushed_nodes: {len(both)} nodes are in both, the first {both[:5].tolist()}; "
-            "they cannot rest and move by the displacement"
+            "a node cannot be both fixed and displaced"
         )
     points, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
     if order == 2:
@@ -577,7 +577,7 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_FRACTION * float(np.linalg.norm(system.load))
         if not residual <= allowed:
-            raise RuntimeError(f"elasticity: not solved, the residual is {residual:.3g} mN where {allowed:.3g} may be")
+            raise RuntimeError(f"elasticity: not solved, the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
         dofs[system.free] = solution
     return dofs.reshape(-1, n) @ system.frame.T, n_steps
 
@@ -681,9 +681,9 @@ def _checked_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     """Poisson's ratios of the cells, (M,)."""
     ratios = np.asarray(nu, dtype=np.float64)
     if ratios.shape not in ((), (len(mesh.cells),)):
-        raise InputError(f"nu: expected one ratio, or one for each of {len(mesh.cells)} cells, got {ratios.shape}")
+        raise InputError(f"nu: expected one ratio or one for each of {len(mesh.cells)} cells, got shape {ratios.shape}")
     if not ((ratios > -1.0) & (ratios < 0.5)).all():
-        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue take 0.45 to 0.49")
+        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue use 0.45 to 0.49")
     return np.broadcast_to(ratios, (len(mesh.cells),))
 
 

@@ -95,11 +95,11 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
         As `tetopt.fem.voxels.solve_voxels`.
     """
     if not (modulus.data > 0.0).all():
-        raise InputError(f"modulus: expected moduli above 0 kPa in every voxel, got down to {modulus.data.min():g}")
+        raise InputError(f"modulus: expected values above 0 kPa in every voxel, got as low as {modulus.data.min():g}")
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
     n_dofs = modulus.ndim * float(np.prod(np.array(modulus.shape) + 1))
-    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "ask for fewer (`reference_dofs`)")
+    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "use fewer (`reference_dofs`)")
     grid = grid_of(modulus, nu)
     push = push_of(modulus, percent)
     half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))
@@ -143,7 +143,7 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
     owner = cell_of_voxel(exact.modulus, mesh).ravel()
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:
-        raise InputError("mesh: no voxel centre of the reference lies in it")
+        raise InputError("mesh: no voxel centre of the reference lies inside the mesh")
     is_near = near_interface(np.asarray(labels)).ravel()
     elements, order = elements_of(mesh, order_of(mesh, u)), order_of(mesh, u)
     error, scale, size, strain_error, strain_size = np.zeros(5)
@@ -202,7 +202,7 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
     """
     n = image.ndim
     if len(shape) != n or any(not 1 <= c <= s for c, s in zip(shape, image.shape, strict=False)):
-        raise InputError(f"averaged: expected up to {image.shape} voxels, got {shape}")
+        raise InputError(f"averaged: expected at most {image.shape} voxels, got {shape}")
     data = block_means(image.data.astype(np.float64), shape)
     return _over_same_box(image, data)
 

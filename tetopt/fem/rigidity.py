@@ -56,13 +56,11 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
     is_used[cells] = True
     unused = np.flatnonzero(~is_used & ~is_prescribed.all(axis=1))
     if len(unused):
-        raise InputError(
-            f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; take them out of the mesh"
-        )
+        raise InputError(f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; remove them")
     if not is_prescribed.any():
         raise InputError(
-            "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
-            "hold:SET and spring:SET:K do"
+            "mesh: it can move freely, as no displacement or spring constrains it; fix or support at least one set, "
+            "as hold:SET and spring:SET:K do"
         )
     body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
@@ -70,8 +68,8 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
     if weakest < LOOSE_VIOLATION:
         inside = np.flatnonzero(body == loose)
         raise InputError(
-            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still turn or slide "
-            "as a whole, they hang by too few nodes; hold more nodes or keep the largest facet-connected set"
+            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still rotate or slide "
+            "as a whole: too few nodes connect them; fix more nodes or keep the largest facet-connected set"
         )
 
 
@@ -86,8 +84,8 @@ def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescrib
         piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
-            f"mesh: {n_pieces} components have no node that is held, pushed or on a spring, the first has {len(piece)} "
-            f"cells around cell {piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
+            f"mesh: {n_pieces} components have no node that is fixed, displaced or on a spring; the first has "
+            f"{len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); fix it or remove it"
         )
 
 

@@ -160,7 +160,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     if not 1 <= step <= n_steps:
         raise InputError(f"step: expected 1 to {n_steps}, got {step}")
     if model.materials is None:
-        raise InputError("model: its cells have no moduli; give `young`")
+        raise InputError("model: the cells have no moduli; give `young`")
     task = _task(model, in_step(model.loads, step))
     young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
     system = constrained(
@@ -283,7 +283,7 @@ def _check_balance(
     allowed = size * (residual + BALANCE_ROUNDING * float(system.K.diagonal() @ np.abs(u.ravel())))
     if not left <= allowed:
         raise RuntimeError(
-            f"elasticity: forces and reactions do not balance, {left:.3g} mN are left where {allowed:.3g} may be"
+            f"elasticity: forces and reactions do not balance: the remainder {left:.3g} mN exceeds {allowed:.3g} mN"
         )
 
 

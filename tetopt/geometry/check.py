@@ -99,12 +99,12 @@ def _problems_of_nodes(mesh: Mesh) -> list[str]:
     problems = []
     unused = np.flatnonzero(np.bincount(mesh.cells.ravel(), minlength=len(mesh.points)) == 0)
     if len(unused):
-        problems.append(f"nodes that no cell uses: {_first(unused)}")
+        problems.append(f"unused nodes: {_first(unused)}")
     order = np.lexsort(mesh.points.T)
     same = (mesh.points[order[1:]] == mesh.points[order[:-1]]).all(axis=1)
     if same.any():
         pairs = np.column_stack([order[:-1], order[1:]])[same]
-        problems.append(f"pairs of nodes in one place: {_first(np.sort(pairs, axis=1))}")
+        problems.append(f"pairs of nodes at the same position: {_first(np.sort(pairs, axis=1))}")
     return problems
 
 
@@ -113,13 +113,13 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
     ordered = np.sort(mesh.cells, axis=1)
     repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(repeated):
-        problems.append(f"cells with a corner twice: {_first(repeated)}")
+        problems.append(f"cells with a repeated corner: {_first(repeated)}")
     flat = np.flatnonzero(~(volumes(mesh.points, mesh.cells) > 0.0))
     if len(flat):
-        problems.append(f"cells that are flat or inverted: {_first(flat)}")
+        problems.append(f"flat or inverted cells: {_first(flat)}")
     _, index, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
-        problems.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
+        problems.append(f"duplicate cells: {_first(np.sort(index[counts > 1]))}")
     return problems
 
 
@@ -147,9 +147,7 @@ def _problems_of_facets(mesh: Mesh) -> list[str]:
     shared = facets(mesh.cells)
     pairs = folded(mesh.cells, shared)
     if len(pairs):
-        problems.append(
-            f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}"
-        )
+        problems.append(f"facets with both cells on the same side, or with more than two cells; cells: {_first(pairs)}")
     outer = shared.nodes[shared.n_cells == 1]
     if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
         edges = np.sort(outer[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
@@ -187,7 +185,7 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
     """
     labels = np.zeros(len(mesh.cells), dtype=np.int64) if of_cell is None else np.asarray(of_cell)
     if labels.shape != (len(mesh.cells),) or not ((np.rint(labels) == labels) & (labels >= 0)).all():
-        raise InputError(f"of_cell: expected a whole number from 0 for each of the mesh's {len(mesh.cells)} cells")
+        raise InputError(f"of_cell: expected a whole number >= 0 for each of the mesh's {len(mesh.cells)} cells")
     at_ridges, at_nodes = pinches(facets(mesh.cells), labels.astype(np.int64))
     whose = "the boundary" if of_cell is None else "the interface of two labels"
     problems = []
@@ -223,8 +221,8 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh
     pairs = folded(mesh.cells, shared)
     if len(pairs):
         raise InputError(
-            f"{source}: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "
-            f"first are of cells {pairs[:3].tolist()}; mend the mesh"
+            f"{source}: at {len(pairs)} facets cells overlap (inverted cells do) or more than two cells meet; the "
+            f"first belong to cells {pairs[:3].tolist()}; repair the mesh"
         )
 
 

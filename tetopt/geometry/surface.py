@@ -33,7 +33,7 @@ LARGEST_SHIFT_FRACTION = 0.1
 SEARCH_STEPS = 20
 
 FOLDED_MESSAGE = (
-    "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt quality --check`"
+    "surface: expected a conforming mesh, but some of the chosen cells overlap; see `tetopt quality --check`"
 )
 
 
@@ -154,7 +154,7 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
             raise InputError(f"surface: expected a mask of {len(cells)} cells, got shape {chosen.shape}")
         chosen = np.flatnonzero(chosen)
     if chosen.size == 0:
-        raise InputError("surface: no cell is chosen, expected at least one; choose another threshold or label")
+        raise InputError("surface: expected at least one cell, got none; choose another threshold or label")
     if not np.issubdtype(chosen.dtype, np.integer):
         raise InputError(f"surface: expected cells as a mask or as indices, got {chosen.dtype}")
     if chosen.min() < 0 or chosen.max() >= len(cells):

@@ -99,7 +99,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
     if mask is not None and mask.shape != labels.shape:
-        raise InputError(f"mask: expected the shape of labels, {labels.shape}, got {mask.shape}; resample it first")
+        raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
     shared = facets(mesh.cells)
     sides = of_cell[shared.cells]
     is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
@@ -185,7 +185,7 @@ def label_thickness(
     of_cell = checked_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
     if members is None:
-        raise InputError("content: expected labels with smooth interfaces, got none; make it by content(image, labels)")
+        raise InputError("content: expected labels with smooth interfaces, got none; use content(image, labels)")
     inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)

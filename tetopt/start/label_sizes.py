@@ -189,10 +189,10 @@ def parse_label_size(text: str | float) -> LabelSize:
         )
     except ValueError:
         raise InputError(
-            f'label_size: expected mm, or a part of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
+            f'label_size: expected mm, or a fraction of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
         ) from None
     if not (0.0 < size.length < np.inf and 0.0 <= size.least <= size.most and size.most > 0.0):
-        raise InputError(f'label_size: expected lengths above 0 mm, the bounds rising, got "{text}"')
+        raise InputError(f'label_size: expected lengths above 0 mm with increasing bounds, got "{text}"')
     return size
 
 
@@ -267,7 +267,7 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     """The size of each label that has one, by its row; InputError for labels that there are not, and wrong values."""
     members = content.memberships
     if members is None:
-        raise InputError("sizes: cells_across and by_label take labels whose interfaces are smooth; give labels")
+        raise InputError("sizes: cells_across and by_label require labels with smooth interfaces; give labels")
     if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
         raise InputError(f"cells_across: expected above 0 to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
     by_label = {
@@ -278,7 +278,7 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     rows = {int(label): row for row, label in enumerate(members.labels)}
     if missing := [label for label in by_label if label not in rows]:
         names = ", ".join(map(str, rows))
-        raise InputError(f"label_size: no voxel that is meshed has label {missing[0]}; there are {names}")
+        raise InputError(f"label_size: no meshed voxel has label {missing[0]}; the labels are {names}")
     rules = {rows[int(label)]: size for label, size in by_label.items()}
     return rules if rest is None else {row: rules.get(row, rest) for row in rows.values()}
 

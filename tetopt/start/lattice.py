@@ -102,13 +102,13 @@ def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[
     except TypeError:
         blocks = ()
     if len(blocks) != n or min(blocks) < 1:
-        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {counts!r}")
+        raise InputError(f"lattice: expected {n} whole numbers >= 1 for blocks, got {counts!r}")
     if _node_count(kind, blocks) > MAX_NODES:
         raise InputError(
-            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; ask for fewer"
+            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; use fewer blocks"
         )
     n_nodes = _node_count(kind, blocks)
-    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "ask for fewer")
+    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "use fewer nodes")
     return blocks
 
 
@@ -119,7 +119,7 @@ def _node_count(kind: str, blocks: tuple[int, ...]) -> int:
 
 def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[int, ...]:
     if not (np.isfinite(spacing) and spacing > 1e-300):
-        raise InputError(f"lattice: spacing must be a length above 0 mm, got {spacing}")
+        raise InputError(f"lattice: expected a spacing above 0 mm, got {spacing}")
     return tuple(max(1, round(min(length / spacing, MAX_NODES))) for length in lengths)
 
 
@@ -131,7 +131,7 @@ def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int
     """
     fewest = _node_count(kind, (1,) * len(lengths))
     if not fewest <= nodes <= MAX_NODES:
-        raise InputError(f"lattice: nodes must lie between {fewest} and {MAX_NODES} for {kind}, got {nodes}")
+        raise InputError(f"lattice: expected {fewest} to {MAX_NODES} nodes for {kind}, got {nodes}")
     per_block = 1 if kind == "five-tet" else 2
     edge = (np.prod(lengths) * per_block / nodes) ** (1.0 / len(lengths))
     candidates: set[tuple[int, ...]] = set()

@@ -124,8 +124,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
         if limits.target is None and enough <= prod(content.image.shape):  # the bound is low: the coarsest octree tells
             enough = len(_octree_within(content, nodes, limits).points)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
-            f"ask for {np.ceil(enough):.0f}, or allow longer edges"
+            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need at least {least:.4g}; "
+            f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
     mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
@@ -134,7 +134,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
-        f"nearest octree found has {count}; ask for about as many, or for a uniform mesh"
+        f"nearest octree found has {count}; use about as many, or a uniform mesh"
     )
 
 
@@ -156,8 +156,8 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         shape = " x ".join(map(str, image.shape))
-        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
-    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "ask for fewer")
+        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; use fewer")
+    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "use fewer")
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
@@ -167,7 +167,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     target = None
     if sizes.has_target:
         check_in_memory(
-            image, "sizes: largest and field are for each voxel",
+            image, "sizes: largest and field require the voxels",
             "use smallest, longest, coarsest and gradation, or crop it",
         )  # fmt: skip
         target = _target(image, sizes)
@@ -222,7 +222,7 @@ def _check_not_below_voxels(image: Image, nodes: float) -> None:
     """InputError if there are more nodes than voxels."""
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         raise InputError(
-            "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
+            "sizes: the requested edges are so short that cells are smaller than voxels; allow longer ones"
         )
 
 
@@ -456,8 +456,8 @@ def _best_division(
     if best is None:
         least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits, image.ndim)
         raise InputError(
-            f"sizes: edges of {least:.3g} mm are asked for, but blocks below a voxel ({image.spacing.max():.3g} mm) "
-            "see nothing; allow longer ones"
+            f"sizes: the requested edges of {least:.3g} mm need blocks smaller than a voxel "
+            f"({image.spacing.max():.3g} mm); allow longer ones"
         )
     return best[1:]
 

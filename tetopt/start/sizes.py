@@ -147,11 +147,11 @@ class Sizes(NamedTuple):
         if not 0.05 <= self.slope <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.cells_across is not None or self.by_label:
-            raise InputError("sizes: cells_across and by_label are settled by `sizes_by_label`, with the labels; do so")
+            raise InputError("sizes: cells_across and by_label depend on labels; call `sizes_by_label` first")
         if self.field is not None and self.field.ndim != n:
-            raise InputError(f"field: expected one in {n}-D, as the image is, got a {self.field.ndim}-D one")
+            raise InputError(f"field: expected a {n}-D field like the image, got a {self.field.ndim}-D one")
         if self.field is not None and not (self.field.data > 0.0).any():
-            raise InputError("field: no voxel is above 0; give lengths in mm")
+            raise InputError("field: expected lengths above 0 mm, got none")
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:

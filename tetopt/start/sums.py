@@ -74,7 +74,7 @@ def channels_of(content: Content) -> Channels:
 def _check_squares(scale: float, n_voxels: int) -> None:
     """InputError if the squares of deviations up to this one may not be summed."""
     if not np.isfinite(scale * scale * n_voxels):
-        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
+        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale the image first")
 
 
 class BlockSums(NamedTuple):
