@@ -270,7 +270,7 @@ class Mesh:
         Raises
         ------
         InputError
-            As `from_pyvista`.
+            As for `from_pyvista`.
 
         Examples
         --------

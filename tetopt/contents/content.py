@@ -27,7 +27,7 @@ from tetopt.image import Image
 RARITY_POWER = 0.5  # exponent of a label's fraction of the voxels by which its voxels count less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres no farther apart coincide
 STEPS_PER_SIGMA = 256.0  # least number of integer steps in a contrast's standard deviation
-WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight, besides 0
+WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight other than 0
 MOST_TENSION = 10.0  # voxels; details of twice this radius would vanish
 SMOOTH_INTERFACES = 0.3  # voxels, the default tension: details up to twice this radius vanish
 # Fraction of the local edge: facets of nodes exactly on a curved surface would cut it off. 0.1 gives more folds, and no

@@ -22,7 +22,7 @@ from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
-PARTITION_BYTES = 40.0  # per voxel besides levels: its label, the nearest label, and temporaries
+PARTITION_BYTES = 40.0  # per voxel, in addition to levels: its label, the nearest label, and temporaries
 NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
 FARTHEST_LEVEL = 6.0  # levels are clipped there: nodes that move in steps near an interface need no larger ones
 FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label are irrelevant, more than levels and smoothing use

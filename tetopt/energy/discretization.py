@@ -21,7 +21,7 @@ def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        As `tetopt.energy.sampling.cell_moments`.
+        As for `tetopt.energy.sampling.cell_moments`.
     """
     moments = cell_moments(image, mesh)
     return moments.n_voxels * moments.variance * image.voxel_volume
@@ -79,7 +79,7 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     Raises
     ------
     InputError
-        As `tetopt.energy.sampling.cell_moments`.
+        As for `tetopt.energy.sampling.cell_moments`.
     """
     grid = channel_grid(content, mesh.points)
     ticks = to_ticks(content.image.to_index(mesh.points), grid)

@@ -190,7 +190,7 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
 
     Examples
     --------
@@ -225,7 +225,7 @@ def overlap_of(image: Image, mesh: Mesh) -> Overlap | None:
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
     """
     n_voxels, *rest = _visited(mesh, _placed(image, mesh)).shared.tolist()
     voxel, cells = rest[3 - image.ndim : 3], rest[3:]
@@ -274,7 +274,7 @@ def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
     """
     return _ranges(image, mesh, _sampled(image, mesh))
 
@@ -381,7 +381,7 @@ def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None
     Raises
     ------
     InputError
-        As `sampling_grid`.
+        As for `sampling_grid`.
     """
     grid = sampling_grid(content.image, points, bits)
     if content.is_plain and content.region is None:
@@ -501,11 +501,11 @@ def _volume(prefix: NDArray, bits: int) -> Volume:
 
 
 class _Filling(NamedTuple):
-    """The sums to be filled in, and what of."""
+    """The sums to fill in, and their inputs."""
 
     volume: Volume
     data: Floats3  # prefix sums of 64 bits, or one empty voxel if they have 32
-    single: Singles3  # likewise
+    single: Singles3  # prefix sums of 32 bits, or one empty voxel
     is_single: bool  # True if they have 32 bits
     shift: float
 
@@ -749,7 +749,7 @@ def facet_flux(
 
 
 class _Fluxes(NamedTuple):
-    """The fluxes to be filled in, and what of."""
+    """The fluxes to fill in, and their inputs."""
 
     fluxes: Floats3
     ticks: Ints2
@@ -780,7 +780,7 @@ def _fill_fluxes(work: _Fluxes, chunk: int) -> None:
 
 
 class _Sums(NamedTuple):
-    """The sums to be filled in, and what of."""
+    """The sums to fill in, and their inputs."""
 
     sums: Floats2
     fluxes: Floats2

@@ -16,7 +16,7 @@ POINTS_PER_TASK = 64  # points that a parallel task handles at once
 
 
 class _Search(NamedTuple):
-    """The squared distances to fill in, and their points and triangles."""
+    """The squared distances to fill in, and their inputs."""
 
     squares: Floats1
     points: Floats2

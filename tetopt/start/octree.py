@@ -62,7 +62,7 @@ NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that do not 
 TARGET_SLACK = 0.25
 OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, assembled and sorted: 600; as many for clipping
 BLOCK_FIELD_BYTES = 8.0  # per smallest block and field
-OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half a field during halving
+OTHER_FIELDS = 4  # in addition to the sums: targets, the errors of all depths, and half a field during halving
 # Limit for the summed blocks, whose halves are the smallest leaves that content can cause: 0.5 GB. 1024^3 voxels never
 # reach it; with 2048^3 voxels, leaves have at least 4 voxels.
 MOST_BLOCKS = 2**24

@@ -159,11 +159,11 @@ class Sizes(NamedTuple):
         Parameters
         ----------
         image : Image
-            Whose box the mesh covers.
+            The image whose box the mesh covers.
         nodes : int
             Number of nodes of the mesh.
         volume : float, optional
-            Of the mesh, mm^n; by default of the box.
+            Volume of the mesh, mm^n; by default that of the box.
 
         Returns
         -------
@@ -196,7 +196,7 @@ class Sizes(NamedTuple):
         Parameters
         ----------
         image : Image
-            Whose voxels are taken.
+            Image with the target voxels.
 
         Returns
         -------
@@ -290,7 +290,7 @@ class Sizes(NamedTuple):
         Parameters
         ----------
         image : Image
-            Whose box the mesh covers.
+            The image whose box the mesh covers.
         nodes : int
             Number of nodes of the mesh.
         points, cells : (N, n) float64, (M, n+1) int64
@@ -300,7 +300,7 @@ class Sizes(NamedTuple):
         target : (N,) float64
             Target size there, mm (`around`).
         volume : float, optional
-            Of the mesh, mm^n; by default of the box.
+            Volume of the mesh, mm^n; by default that of the box.
 
         Returns
         -------
