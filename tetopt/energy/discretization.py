@@ -60,7 +60,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice_mesh(image, nodes=300)
-    >>> whole = float(image.data.var()) * image.volume  # what one cell for all would have
+    >>> whole = float(image.data.var()) * image.volume  # the value of a single cell
     >>> print(f"{tetopt.E_D(image, mesh) / whole:.2f}")
     0.07
     >>> graded = tetopt.mesh_image(image, 300, iterations=4).mesh

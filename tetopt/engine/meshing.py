@@ -169,13 +169,13 @@ def mesh_image(
     >>> len(result.mesh.points), dict(result.violated), ratio > 100
     (300, {}, True)
 
-    As many nodes as an error takes, here a fifth of the image's variance:
+    Find the nodes for an error, here a fifth of the image's variance:
 
     >>> result = tetopt.mesh_image(image, target_error=0.2, iterations=4)
     >>> print(f"{tetopt.E_D(image, result.mesh) / (image.data.var() * image.volume):.2f}")
     0.14
 
-    A mesh of yours, made better:
+    Improve an existing mesh:
 
     >>> result = tetopt.mesh_image(image, start=tetopt.lattice_mesh(image, nodes=300), iterations=3)
     >>> result.history[-1].E < 1

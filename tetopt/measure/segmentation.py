@@ -44,7 +44,7 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> labels = tetopt.segment(image, tetopt.mesh_image(image, 300, iterations=4).mesh, 2)
     >>> truth = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
-    >>> int((labels.data != truth.data).sum())  # voxels that are not as in the phantom
+    >>> int((labels.data != truth.data).sum())  # voxels that differ from the phantom
     20
     """
     moments = cell_moments(image, mesh)
