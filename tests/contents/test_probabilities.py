@@ -130,7 +130,7 @@ def test_bytes_are_taken_as_such():
 @pytest.mark.parametrize("high", [100.0, 2.0, 256.0, 200.5, 1.01])
 def test_other_scales_are_refused(high):
     image = tetopt.Image(np.array([[0.0, high]]))
-    with pytest.raises(InputError, match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; divide by"):
+    with pytest.raises(InputError, match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; first divide by"):
         tetopt.resample_tissue(image, image, "c1")
 
 
@@ -193,7 +193,7 @@ def test_the_same_on_any_number_of_threads():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"labels": True}, "labels and tissues: give one of them"),
+        ({"labels": True}, "labels and tissues: expected at most one"),
         ({"tissues": []}, "tissues: expected one image or more, got 0"),
         ({"tissues": (2.0, 1.0)}, "tissues, number 1: expected probabilities from 0 to 1, got 0 to 2"),
         ({"tissues": (1.0, -1.0)}, "tissues, number 2: expected probabilities from 0 to 1, got -1 to"),
@@ -216,7 +216,7 @@ def test_refused(change, match):
 
 def test_tissues_of_another_shape_or_place_are_refused():
     image, tissues, _ = blurred(12)
-    with pytest.raises(InputError, match=r"number 2: expected shape \(12, 12, 12\) as the first, got \(11, 12, 12\)"):
+    with pytest.raises(InputError, match=r"number 2: expected shape \(12, 12, 12\) like the first, got \(11, 12, 12\)"):
         tetopt.content(image, tissues=[tissues[0], tetopt.Image(tissues[1].data[1:])])
     moved = [tetopt.Image(tissue.data, np.diag([1.0, 1.0, 1.1, 1.0])) for tissue in tissues]
     with pytest.raises(InputError, match="number 1: expected the same voxel grid"):

@@ -568,7 +568,7 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
         ({"young": [np.nan, -2.5]}, "got 2 others, the first nan in cell 0, -2.5 in cell 1"),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
-        ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue take 0.45 to 0.49"),
+        ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue use 0.45 to 0.49"),
         ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan"),
         ({"fixed_nodes": []}, "fixed_nodes: expected at least one node, got none"),
         ({"fixed_nodes": [2.0, 3.0]}, "fixed_nodes: expected a list of node numbers, got float64 of shape (2,)"),

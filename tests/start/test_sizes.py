@@ -93,7 +93,7 @@ def test_targets_in_one_half(shape, stretch):
     ends, length = edges(mesh)
     has_none = (sizes.prepared(len(shape)).at(mesh.points)[ends] == np.inf).all(axis=1)
     assert length[has_none].mean() > 1.2 * length[~has_none].mean()
-    with pytest.raises(tetopt.InputError, match=r"nodes are too few for .* voxels and these limits .* ask for"):
+    with pytest.raises(tetopt.InputError, match=r"nodes are too few for .* voxels and these limits .* use"):
         tetopt.mesh_image(image, nodes // 3, sizes=sizes)
 
 
@@ -278,9 +278,9 @@ def test_sizes_around_are_the_twin_s():
 @pytest.mark.parametrize("sizes", [Sizes(longest=4.0), Sizes(longest=7.0), Sizes(edge_size=5.0)])
 def test_a_refusal_names_a_number_that_will_do(sizes):
     image = tetopt.Image(100.0 * (np.indices((30, 30, 30)).sum(0) > 40))
-    with pytest.raises(tetopt.InputError, match="ask for") as refusal:
+    with pytest.raises(tetopt.InputError, match="; use ") as refusal:
         tetopt.octree_mesh(image, 60, sizes)
-    nodes = int(re.search(r"ask for (\d+)", str(refusal.value))[1])
+    nodes = int(re.search(r"; use (\d+)", str(refusal.value))[1])
     assert len(tetopt.octree_mesh(image, nodes, sizes).points) > 0.5 * nodes
 
 
@@ -399,7 +399,7 @@ def test_target_error_within_limits():
 @pytest.mark.parametrize(
     ("image", "arguments", "words"),
     [
-        (ball(30, 30, 30), {}, "one of them"),
+        (ball(30, 30, 30), {}, "exactly one of"),
         (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "exactly one of"),
         (ball(30, 30, 30), {"target_error": 1.0}, "expected a fraction of the image's variance, 0 to 1"),
         (ball(30, 30, 30), {"target_error": float("nan")}, "expected a fraction"),

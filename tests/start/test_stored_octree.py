@@ -163,7 +163,7 @@ def spoiled(value, dtype=np.float32):
     ("data", "words"),
     [
         (spoiled(np.nan), r"2 voxels are NaN or infinite, the first at index \(7, 3, 5\)"),
-        (spoiled(1e160, np.float64), "squares overflow"),
+        (spoiled(1e160, np.float64), "squares would overflow"),
         (noisy((12, 12, 12), np.complex64), "complex"),
         (np.zeros((12, 12, 12), dtype=[("R", "u1"), ("G", "u1")]), "RGB"),
     ],
