@@ -90,7 +90,7 @@ def save_failure(out, key, reason):
 
 ODD = {  # what is wrong with each of these, of a hundred
     7: {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}, 19: {"mask_volume": 0.61e6}, 31: {"lost": 17},
-    43: {"violated": {"min_dihedral": "3 of 45000 cells have an angle under 12 degrees, down to 8.10"}},
+    43: {"violated": {"min_dihedral": "3 of 45000 cells have a dihedral angle below 12 degrees, down to 8.10"}},
     59: {"absent": 53},
 }  # fmt: skip
 

@@ -80,7 +80,7 @@ def test_a_voxel_is_the_first_cell_s_that_holds_it(n, name):
         assert alone[one][overlap.voxel]
         assert alone[other][overlap.voxel]
         assert overlap.n_voxels == twice.sum()
-        assert f"cells {one} and {other} both hold voxel {list(overlap.voxel)}" in str(overlap)
+        assert f"cells {one} and {other} both contain voxel {list(overlap.voxel)}" in str(overlap)
 
 
 def numbers_of(value):

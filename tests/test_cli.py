@@ -408,8 +408,8 @@ def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
 
 BAD_OPTIONS = [
     ("--nodes 6", "9 or more in 3-D, got 6"),
-    ("--uniform --nodes 6", "nodes must lie between 9 and"),
-    ("--nodes 99999999999", "nodes must lie between 9 and"),
+    ("--uniform --nodes 6", "expected 9 to 50000000 nodes"),
+    ("--nodes 99999999999", "expected 9 to 50000000 nodes"),
     ("--nodes -5", "--nodes: expected a whole number, 5 or more, got -5"),
     ("--spacing 0", "--spacing: expected a length above 0 mm"),
     ("--k-d 1", "--k-d: expected 0 <= k_D < 1, got 1.0"),
@@ -458,7 +458,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality", "Missing argument 'MESH'"),
-        ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; give one of constant"),
+        ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),
         ("phantom sphere -o a.png", "ends in .nii or .nii.gz"),
         ("phantom sphere -o a.nii --labels ./a.nii", "or another output"),
@@ -790,7 +790,7 @@ def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
     assert exit_code("quality", *words, "--json", tmp_path / "q.json") == 1
     overlap = numbers_in(tmp_path / "q.json")["fit"]["overlap"]
     assert overlap["cells"] == [1, len(mesh.cells) - 3]
-    assert f"cells 1 and {len(mesh.cells) - 3} both hold voxel {overlap['voxel']}" in capsys.readouterr().err
+    assert f"cells 1 and {len(mesh.cells) - 3} both contain voxel {overlap['voxel']}" in capsys.readouterr().err
     assert exit_code("segment", words[2], words[0], "-o", tmp_path / "s.nii.gz") == 2
     assert "twice.vtu: cells overlap: " in capsys.readouterr().err
     assert not (tmp_path / "s.nii.gz").exists()
@@ -840,7 +840,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
-        (["--edge-size", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
+        (["--edge-size", "0.2"], "sizes: the requested edges are so short that cells are smaller"),
         (["--size-min", "9", "--edge-max", "8"], "--edge-max: 8 mm is below the smallest size, 9 mm"),
         (["--edge-size", "-1"], "--edge-size: expected a length above 0"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
@@ -935,7 +935,7 @@ def test_target_error(tmp_path, inputs, capfd):
     assert numbers_in(tmp_path / "a.json")["mesh_sha256"] == numbers["mesh_sha256"]
     capfd.readouterr()
     assert exit_code(*command, "--force", "--target-error", "0.01", "--size-min", "32") == 1
-    assert "left in the cells, more than 0.01" in capfd.readouterr().err
+    assert "of the image's variance is unexplained, more than 0.01" in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------

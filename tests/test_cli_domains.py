@@ -162,7 +162,7 @@ def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, mor
     fraction = second["fit"]["E_D_fraction_of_variance"]
     assert fraction == pytest.approx(first["energies"]["E_D_fraction_of_variance"], rel=1e-9)
     assert set(second["violated"]) == set(first["violated"]) >= {"error"}
-    assert [line for line in said.err.splitlines() if "variance is left" in line] == judged.err.splitlines()[-1:]
+    assert [line for line in said.err.splitlines() if "variance is unexplained" in line] == judged.err.splitlines()[-1:]
     name = re.search("E_D, fraction of .* variance(?= )", said.out)[0]
     assert f"{name} " in judged.out
     assert f"{fraction:.5f}" in judged.out
@@ -333,6 +333,6 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         words = ["quality", tmp_path / "a.vtu", "--image", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz"]
         assert exit_code(*words) == expected
         said = capsys.readouterr()
-        assert ("overlap only by Dice 0.333" in said.err) == bool(expected)
+        assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
         assert "one of them is not there" in said.out

@@ -89,7 +89,7 @@ def test_volumes_and_names_as_they_are_given(folder):
 
 def test_bytes_and_other_grids_are_told(folder, capsys):
     assert exit_code(*words(folder, "--tissues", folder / "bytes.nii.gz", "--crop", "0:16,0:16,1:16")) == 0
-    assert capsys.readouterr().err.count("taken as probabilities times 255") == 2
+    assert capsys.readouterr().err.count("read as probabilities times 255") == 2
     fine = tetopt.Image(ROWS[0], np.diag([1.0, 1.0, 1.1, 1.0]))
     tetopt.save_image(folder / "grey.nii.gz", fine)
     assert exit_code(*words(folder, "--tissues", both(folder))) == 0

@@ -109,7 +109,7 @@ TASKS = {
     ),
     "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
     "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
-    "labels: 3 of them on 1512 .*divided by 1 x 1 x 3: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
+    "labels: 3 labels on 1512 .*division by 1 x 1 x 3.*: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
     "elasticity: the stiffness of .* cells of 10 nodes: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
     "reference: 2160 degrees of freedom: needs.*`reference_dofs`": lambda: reference(IMAGE, 0.3),
     "^octree: 100 nodes: needs.*ask for fewer": lambda: tetopt.mesh_image(IMAGE, 100),

@@ -16,17 +16,17 @@ from tetopt.errors import InputError
 from tetopt.interop import notebook
 from tetopt.system.budget import check_memory
 
-SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
-# Of a voxel's longest to its shortest extent, shear included: slices of 10 mm with pixels of 0.1 mm have 100. At a
-# million the lattice has more cells across one voxel than fit memory.
+SINGULAR_DETERMINANT = 1e-6  # determinant of the axes' directions, below which they do not span the space
+# Ratio of a voxel's longest to its shortest extent, shear included: slices of 10 mm with pixels of 0.1 mm have 100. At
+# a million the lattice has more cells across one voxel than fit into memory.
 MOST_ASPECT = 1000.0
-LENGTH_RANGE = (1e-9, 1e9)  # mm, of a voxel's edge: their fifth powers, E_G, are far from where doubles end
-MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates have no ten millionth of a voxel left
-# Of intensities, and of their range: squares, summed over 2^31 voxels, stay within doubles that have all their digits.
+LENGTH_RANGE = (1e-9, 1e9)  # mm, a voxel's edge: fifth powers, as in E_G, stay far within the range of doubles
+MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates do not resolve 1e-7 voxel
+# Limits for intensities and their range: squares summed over 2^31 voxels stay normal doubles.
 INTENSITY_RANGE = (1e-152, 1e148)
-READ_BYTES = 2**28  # of a stored volume at a time, at most: 128 planes of 1024^2 voxels of 16 bits
-PIECE_VOXELS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
-LOADED_BYTES = 16.0  # of a voxel, while all are read: as they are stored, and as floats of either size
+READ_BYTES = 2**28  # most of a stored volume read at a time: 128 planes of 1024^2 voxels of 16 bits
+PIECE_VOXELS = 2**16  # processed at a time: half a megabyte per field, which fits into a processor's cache
+LOADED_BYTES = 16.0  # per voxel while all are read: as stored, and as floats of either size
 
 Box = tuple[slice, slice, slice]
 
@@ -36,27 +36,27 @@ class Image:
     """Scalar intensities h on a grid of voxels, in two or three dimensions.
 
     Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
-    ``shape - 0.5`` along every axis. The affine takes indices to world millimetres, RAS+ in 3-D; it may flip,
-    rotate, shear and scale each axis differently. The voxels are in memory, or stay where they are stored
-    (`Image.stored`, `tetopt.open_stored`), and are read box by box.
+    ``shape - 0.5`` along every axis. The affine maps indices to world millimetres, RAS+ in 3-D; it may flip,
+    rotate, shear and scale each axis differently. The voxels are in memory, or stay in their file
+    (`Image.stored`, `tetopt.open_stored`) and are read box by box.
 
     Parameters
     ----------
     data : (s_0, ..., s_{n-1}) array of real numbers
-        Intensities, n = 2 or 3. Kept as float32 where that loses nothing, else as float64; read-only.
+        Intensities, n = 2 or 3. Kept as float32 if that is lossless, else as float64; read-only.
     affine : (n+1, n+1) array, optional
-        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Kept as float64; read-only.
+        Homogeneous map from index to world mm. By default the identity (1 mm voxels). Kept as float64; read-only.
 
     Raises
     ------
     InputError
-        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or
-        of another size.
+        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or has
+        the wrong size.
 
     See Also
     --------
-    load_image : Read one from a file.
-    open_stored : Leave its voxels in the file.
+    load_image : Read an image from a file.
+    open_stored : Open an image and leave its voxels in the file.
 
     Examples
     --------
@@ -65,7 +65,7 @@ class Image:
     (3, [2.0, 2.0, 3.0], 12.0)
     """
 
-    voxels: Any  # `data`, or whatever gives boxes of what is stored
+    voxels: Any  # `data`, or a stored array that is sliced box by box
     affine: NDArray[np.float64]
 
     def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
@@ -75,25 +75,25 @@ class Image:
 
     @classmethod
     def stored(cls, voxels: Any, affine: ArrayLike | None = None) -> Image:
-        """An image in three dimensions whose voxels stay where they are, and need not fit into memory.
+        """Make a 3-D image whose voxels stay in their array, which need not fit into memory.
 
         Parameters
         ----------
         voxels : array of three axes
-            Whatever has a `shape` and a `dtype` and gives an array of numbers for a tuple of slices: an array of zarr,
-            dask or h5py, or a mapped one of numpy. What values they have is looked at as they are read.
+            Any object with a `shape` and a `dtype` that returns an array of numbers for a tuple of slices: an array of
+            zarr, dask or h5py, or a memory-mapped numpy array. Values are checked as they are read.
         affine : (4, 4) array, optional
-            As of every image.
+            As for `Image`.
 
         Returns
         -------
         Image
-            Of which nothing is read.
+            The image, with nothing read yet.
 
         Raises
         ------
         InputError
-            Other than three axes, an empty axis, or an affine that no image takes.
+            A number of axes other than three, an empty axis, or an invalid affine.
 
         Examples
         --------
@@ -104,22 +104,22 @@ class Image:
         """
         shape = tuple(int(size) for size in voxels.shape)
         if len(shape) != 3 or 0 in shape:
-            raise InputError(f"image: expected three axes with a voxel at least, got shape {shape}")
+            raise InputError(f"image: expected three non-empty axes, got shape {shape}")
         image = cls.__new__(cls)
         vars(image).update(voxels=voxels, affine=checked_affine(np.eye(4) if affine is None else affine, 3))
         return image
 
     @cached_property
     def data(self) -> NDArray[np.floating]:
-        """All intensities, as of `Image(data)`; those of a stored image are read when first asked for, and kept."""
-        check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read boxes of it")
+        """All intensities, as in `Image(data)`; a stored image reads them at first use and keeps them."""
+        check_memory(LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read it box by box")
         whole = _checked_data(self.read((0,) * self.ndim, self.shape))
-        vars(self).update(voxels=whole)  # boxes are read from it from now on
+        vars(self).update(voxels=whole)  # later boxes come from memory
         return whole
 
     @cached_property
     def range(self) -> tuple[float, float]:
-        """The least and the greatest intensity; this and the next three are found once, as each is a pass over all."""
+        """The least and greatest intensity, cached like the next three, as each takes a pass over all voxels."""
         return float(self.data.min()), float(self.data.max())
 
     @cached_property
@@ -135,17 +135,17 @@ class Image:
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether all intensities are whole numbers."""
+        """True if all intensities are whole numbers."""
         return np.array_equal(np.rint(self.data), self.data)
 
     @property
     def is_stored(self) -> bool:
-        """Whether the voxels are where they are stored, and have not been read as a whole."""
+        """True if the voxels are stored outside memory and have not been read as a whole."""
         return "data" not in vars(self)
 
     @property
     def in_memory(self) -> Image | None:
-        """The image itself, unless its voxels are only stored."""
+        """The image itself, or None if its voxels are only stored."""
         return None if self.is_stored else self
 
     @property
@@ -179,7 +179,7 @@ class Image:
         Parameters
         ----------
         index : (..., n) array
-            Voxel centres have whole numbers.
+            Index coordinates; voxel centres have whole numbers.
 
         Returns
         -------
@@ -206,7 +206,7 @@ class Image:
         Returns
         -------
         (..., n) float64
-            Voxel centres have whole numbers.
+            Index coordinates; voxel centres have whole numbers.
 
         Examples
         --------
@@ -218,7 +218,7 @@ class Image:
         return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
 
     def read(self, start: Sequence[int], stop: Sequence[int]) -> NDArray:
-        """The voxels of a box of indices, in memory, of the type that is stored.
+        """Read the voxels of a box of indices into memory, in the stored type.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Image:
         Returns
         -------
         (stop - start) array
-            Of what is in memory a view.
+            The voxels; a view if they are in memory.
 
         Examples
         --------
@@ -239,7 +239,7 @@ class Image:
         return np.asarray(self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
-        """The voxels of a box of indices as an image in memory; every voxel keeps its place in the world.
+        """Read a box of indices as an image in memory; every voxel keeps its place in the world.
 
         Parameters
         ----------
@@ -254,7 +254,7 @@ class Image:
         Raises
         ------
         InputError
-            Values that no `Image` takes, NaN among them.
+            Values that are invalid for an `Image`, such as NaN.
 
         Examples
         --------
@@ -269,19 +269,19 @@ class Image:
 
     @property
     def box_bytes(self) -> float:
-        """Memory that `boxes` take while they are gone over."""
+        """Memory that iterating over `boxes` takes, bytes."""
         return 2.0 * READ_BYTES if self.is_stored else 0.0
 
     def boxes(self) -> Iterator[Box]:
-        """Boxes of whole rows that the voxels are gone over in, plane after plane; a plane is one of a volume.
+        """Iterate over the voxels in boxes of whole rows, plane by plane; a 2-D image is one plane of a volume.
 
-        Those of voxels in memory are small; others are as thick as chunks, and of `READ_BYTES` at most, but that a
-        single row is read whole, whatever it takes.
+        Boxes in memory are small. Stored ones are as thick as chunks and take at most `READ_BYTES`, except that a row
+        is always read whole.
 
         Returns
         -------
         iterator of three slices
-            Along the axes; a plane is the first one of a volume.
+            Slices along the axes of a volume; a 2-D image is its first plane.
 
         Examples
         --------
@@ -295,7 +295,7 @@ class Image:
         chunks = getattr(self.voxels, "chunks", None)
         most_rows = max(READ_BYTES // (s2 * np.dtype(self.voxels.dtype).itemsize), 1)
         if chunks:
-            # Those of dask are all told, along each axis.
+            # dask lists all chunk sizes along each axis.
             n_planes, step = (min(int(np.max(sizes)), s) for sizes, s in zip(chunks[:2], (s0, s1), strict=True))
         elif _is_first_axis_fastest(self.voxels):
             n_planes, step = s0, 1
@@ -315,7 +315,7 @@ class Image:
         return f"{counts} voxels of {sides} mm"
 
     def _repr_html_(self) -> str:
-        """Numbers and the middle slice, for a notebook; of a stored image neither intensities nor a picture."""
+        """Numbers and the middle slice, for a notebook; a stored image shows neither intensities nor a picture."""
         rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
         if self.is_stored:
             return notebook.card_html("Image", rows, "")
@@ -324,10 +324,10 @@ class Image:
 
 
 def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`matrix` (n, n) times each of the vectors (..., n), term by term in the order of the columns.
+    """Multiply each of the vectors (..., n) by `matrix` (n, n), term by term in the order of the columns.
 
-    Not by BLAS, whose rounding depends on the number of threads it finds: a mesh must come out the same to the
-    last bit on every machine.
+    BLAS is not used, as its rounding depends on the number of threads: a mesh must be the same to the last bit on
+    every machine.
     """
     product = vectors[..., :1] * matrix[:, 0]
     for column in range(1, matrix.shape[1]):
@@ -336,16 +336,16 @@ def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> ND
 
 
 def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
-    """A read-only float32 or float64 C-ordered copy of `data`; InputError for what cannot be an image."""
+    """Return a read-only float32 or float64 C-ordered copy of `data`; raise InputError if it cannot be an image."""
     try:
         data = np.asarray(data)
-    except (TypeError, ValueError) as error:  # rows of different length; nibabel's images
+    except (TypeError, ValueError) as error:  # rows of different lengths, or a nibabel image
         raise InputError(f"image data: expected an array of numbers, got {type(data).__name__} ({error})") from error
     check_kind(data.dtype)
     if data.ndim not in (2, 3):
-        raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; pick one volume or slice")
+        raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; select one volume or slice")
     if 0 in data.shape:
-        raise InputError(f"image data: every axis needs a voxel, got shape {data.shape}")
+        raise InputError(f"image data: expected at least one voxel along every axis, got shape {data.shape}")
     is_bad = ~np.isfinite(data)
     if is_bad.any():
         check_finite(int(np.count_nonzero(is_bad)), tuple(int(i) for i in np.argwhere(is_bad)[0]))
@@ -356,42 +356,42 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
 
 
 def check_in_memory(image: Image, what: str, remedy: str) -> None:
-    """InputError unless the voxels are in memory: `what` needs them there; `remedy` says what does not."""
+    """Raise InputError unless the voxels are in memory, as `what` requires; `remedy` names an alternative."""
     if image.is_stored:
-        raise InputError(f"{what} of an image in memory, and this one is stored; {remedy}")
+        raise InputError(f"{what} of an image in memory, but this image is stored; {remedy}")
 
 
 def check_kind(dtype: np.dtype) -> None:
-    """InputError unless the voxels are real numbers."""
+    """Raise InputError unless the voxels are real numbers."""
     if dtype.names is not None or dtype.kind == "O":
-        raise InputError(f"image data: expected one number a voxel, got {dtype}; convert RGB to grey first")
+        raise InputError(f"image data: expected one number per voxel, got {dtype}; convert RGB to grey first")
     if dtype.kind == "c":
-        raise InputError("image data: expected real numbers, got complex ones; take the magnitude first")
+        raise InputError("image data: expected real numbers, got complex ones; compute the magnitude first")
     if dtype.kind not in "buif":
         raise InputError(f"image data: expected numbers, got dtype {dtype}")
 
 
 def check_finite(n_bad: int, first: tuple[int, ...]) -> None:
-    """InputError if there are voxels without a number, the first of them at this index."""
+    """Raise InputError if `n_bad` voxels are not finite, the first at this index."""
     if n_bad > 0:
         raise InputError(
-            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them (for example "
-            "by the background's value) first"
+            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them first, for "
+            "example by the background's value"
         )
 
 
 def check_intensities(low: float, high: float) -> None:
-    """InputError for a range of intensities whose squares cannot be computed with."""
+    """Raise InputError for a range of intensities whose squares overflow or vanish."""
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
-            f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares "
-            f"overflow or vanish, got {low:g} to {high:g}; scale them"
+            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as their squares "
+            f"would overflow or vanish, got {low:g} to {high:g}; rescale them"
         )
 
 
 def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
-    """C-ordered copy as float32 if every value survives, else as float64."""
+    """C-ordered copy as float32 if that is lossless, else as float64."""
     with np.errstate(over="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         single = np.array(data, dtype=np.float32, order="C")
@@ -401,7 +401,7 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
 
 
 def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
-    """A read-only copy of the affine; InputError unless it is (n+1, n+1), finite, homogeneous and regular."""
+    """Return a read-only copy of the affine; raise InputError unless it is (n+1, n+1), finite, homogeneous, regular."""
     try:
         affine = np.array(affine, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -409,9 +409,9 @@ def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     if affine.shape != (n + 1, n + 1):
         raise InputError(f"affine: expected shape ({n + 1}, {n + 1}) for {n}-D data, got {affine.shape}")
     if not np.isfinite(affine).all():
-        raise InputError(f"affine: every entry must be finite, got {affine.tolist()}")
+        raise InputError(f"affine: expected finite entries, got {affine.tolist()}")
     if not np.array_equal(affine[-1], np.eye(n + 1)[-1]):
-        raise InputError(f"affine: the last row must be {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
+        raise InputError(f"affine: expected the last row {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
     columns = affine[:-1, :-1]
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(columns, axis=0)
@@ -420,7 +420,7 @@ def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < SINGULAR_DETERMINANT:
         raise InputError(
             f"affine: it is singular (voxel axes of lengths {lengths.tolist()} mm do not span {n}-D space); "
-            "mend the file's header"
+            "correct the file's header"
         )
     _check_extents(columns, lengths, affine[:-1, -1])
     affine.setflags(write=False)
@@ -428,39 +428,39 @@ def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
 
 
 def _check_extents(columns: NDArray[np.float64], lengths: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
-    """InputError unless voxels are of a size, a shape and in a place that can be computed with."""
+    """Raise InputError unless the size, shape and position of voxels are within the limits."""
     least, most = LENGTH_RANGE
     if lengths.min() < least:
         raise InputError(
-            f"affine: expected voxels of {least:g} to {most:g} mm, got {lengths.tolist()} mm; mend the file's header"
+            f"affine: expected voxels of {least:g} to {most:g} mm, got {lengths.tolist()} mm; correct the file's header"
         )
     extents = np.linalg.svd(columns, compute_uv=False)
     if extents[0] > MOST_ASPECT * extents[-1]:
         raise InputError(
             f"affine: expected voxels at most {MOST_ASPECT:g} times as long as thick, got {extents[0]:.4g} mm by "
-            f"{extents[-1]:.4g} mm (edges of {lengths.tolist()} mm); mend the file's header, or resample it"
+            f"{extents[-1]:.4g} mm (edges of {lengths.tolist()} mm); correct the file's header, or resample the image"
         )
     if np.abs(origin).max() > MOST_OFFSET * lengths.min():
         raise InputError(
             f"affine: expected the first voxel within {MOST_OFFSET:g} voxels of the world's origin, got "
-            f"{origin.tolist()} mm; mend the file's header"
+            f"{origin.tolist()} mm; correct the file's header"
         )
 
 
 def _is_first_axis_fastest(voxels: Any) -> bool:
-    """Whether a mapped array lies in a file as NIfTI has it, so that planes along the first axis are all over it."""
+    """True if a mapped array is stored in NIfTI order, which scatters planes along the first axis over the file."""
     strides = getattr(voxels, "strides", None)
     return strides is not None and abs(strides[0]) < abs(strides[-1])
 
 
 def _boxes(shape: Sequence[int], n_planes: int, n_rows: int) -> Iterator[Box]:
-    """Boxes of so many planes and rows, and of all columns."""
+    """Boxes of up to `n_planes` planes and `n_rows` rows, with all columns."""
     for i in range(0, shape[0], n_planes):
         for j in range(0, shape[1], n_rows):
             yield slice(i, min(i + n_planes, shape[0])), slice(j, min(j + n_rows, shape[1])), slice(0, shape[2])
 
 
 def pieces(shape: Sequence[int]) -> Iterator[Box]:
-    """Boxes of whole rows that a box of voxels (P, R, K) is computed in: plane by plane, and rows in their order."""
+    """Divide a box of voxels (P, R, K) into boxes of whole rows: plane by plane, and rows in order."""
     n_rows = min(shape[1], max(PIECE_VOXELS // shape[2], 1))
     return _boxes(shape, max(PIECE_VOXELS // (n_rows * shape[2]), 1), n_rows)

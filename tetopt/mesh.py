@@ -34,9 +34,9 @@ class Mesh:
         Node indices of each cell, positively oriented: the vectors from the first node to the others form a
         right-handed frame. Read-only.
     midpoints : (E, n) array of float64, optional
-        Places of the nodes in the middle of edges, mm, of quadratic cells whose edges may be curved; in the order of
-        `tetopt.geometry.quadratic.numbered_edges`, by their ends. Without them edges are straight. Linear cells, and
-        everything that is measured or drawn of a mesh, go by the corners alone. Read-only.
+        Mid-edge nodes, mm, of quadratic cells whose edges may be curved, in the order of
+        `tetopt.geometry.quadratic.numbered_edges`, sorted by their ends. Without them edges are straight. Linear cells
+        and all measures and pictures of a mesh use only the corners. Read-only.
 
     Raises
     ------
@@ -46,9 +46,9 @@ class Mesh:
 
     See Also
     --------
-    load_mesh : Read one from a file, with its data.
-    mesh_image : Make one of an image.
-    check_mesh : What is wrong with one.
+    load_mesh : Read a mesh from a file, with its data.
+    mesh_image : Mesh an image.
+    check_mesh : List the defects of a mesh.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class Mesh:
             points = np.array(points, dtype=np.float64, order="C")
             cells = np.asarray(cells)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"mesh: expected arrays of numbers, points and cells ({error})") from error
+            raise InputError(f"mesh: expected arrays of numbers for points and cells ({error})") from error
         if points.ndim != 2 or points.shape[1] not in (2, 3):
             raise InputError(f"mesh points: expected shape (N, 2) or (N, 3), got {points.shape}")
         n = points.shape[1]
@@ -77,15 +77,15 @@ class Mesh:
         cells = np.array(cells, dtype=np.int64, order="C")
         if not np.isfinite(points).all():
             first = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise InputError(f"mesh points: every coordinate must be finite, node {first} is {points[first].tolist()}")
+            raise InputError(f"mesh points: expected finite coordinates, but node {first} is {points[first].tolist()}")
         if cells.min() < 0 or cells.max() >= len(points):
-            raise InputError(f"mesh cells: indices must lie in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
+            raise InputError(f"mesh cells: expected indices in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
         v = volumes(points, cells)
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)
             raise InputError(
                 f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, the first are {bad[:5].tolist()}; "
-                "orient them or mend the mesh"
+                "orient them or repair the mesh"
             )
         points.setflags(write=False)
         cells.setflags(write=False)
@@ -117,20 +117,20 @@ class Mesh:
         off_screen: bool | None = None,
         **look: Any,
     ) -> Any:
-        """Show the mesh in 3-D by pyvista: in a window, in a notebook, or as a picture.
+        """Show the mesh in 3-D with pyvista: in a window, in a notebook, or as a picture.
 
         Parameters
         ----------
         values : (M,) or (N,) array, optional
-            A number for each cell, or else each node, that colours it.
+            A number for each cell, or for each node, to colour the mesh by.
         cut : bool
-            Leave out the cells of the right, front, upper octant of a 3-D mesh, so that its inside shows.
+            Remove the cells of the right, front, upper octant of a 3-D mesh to show its inside.
         name : str
-            What the values are called beside the scale of colours.
+            Name of the values beside the colour bar.
         screenshot : str or Path, optional
-            A picture file to write, such as ".png"; no window opens.
+            Picture file to write, such as ".png"; no window opens.
         off_screen : bool, optional
-            True: open no window and return a picture. By default pyvista's own setting, and True where Linux has no
+            If True, open no window and return a picture. By default pyvista's setting, and True on Linux without a
             display.
         **look
             Further options of `pyvista.Plotter.add_mesh`, such as `cmap="gray"` or `show_edges=False`.
@@ -138,12 +138,13 @@ class Mesh:
         Returns
         -------
         (height, width, 3) array of uint8, or None
-            The picture, if no window opened. A notebook has a view that turns where trame is installed, else a picture.
+            The picture, if no window opened. A notebook shows an interactive view if trame is installed, else a
+            picture.
 
         Raises
         ------
         InputError
-            Neither a number for each cell nor for each node.
+            Values that match neither the number of cells nor that of nodes.
 
         Examples
         --------
@@ -166,23 +167,23 @@ class Mesh:
         return conversions.show_grid(grid, next(iter(colours), None), screenshot, off_screen, look)
 
     def to_pyvista(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> pyvista.UnstructuredGrid:
-        """The mesh for pyvista, with data; a 2-D mesh lies in the plane z = 0.
+        """Convert the mesh to pyvista, with data; a 2-D mesh lies in the plane z = 0.
 
         Parameters
         ----------
         cell_data, point_data : dict of arrays, optional
-            Numbers by name, a row a cell, or a row a node; the first of each is the active one. Rows of more
-            than one axis become rows of numbers, True and False 1 and 0.
+            Numbers by name, one row per cell or per node; the first of each is active. Rows of more than one axis are
+            flattened; True and False become 1 and 0.
 
         Returns
         -------
         pyvista.UnstructuredGrid
-            Of VTK's kind triangle or tetra, a copy. Nodes and cells keep their order.
+            A copy, with VTK cells of kind triangle or tetra. Nodes and cells keep their order.
 
         Raises
         ------
         InputError
-            Data that are no numbers, or have other numbers of rows.
+            Data that are not numbers, or with the wrong number of rows.
 
         Examples
         --------
@@ -195,17 +196,17 @@ class Mesh:
 
     @classmethod
     def from_pyvista(cls, grid: pyvista.DataSet) -> Mesh:
-        """The tetrahedra of one of pyvista's grids, or of VTK's; without any, its triangles.
+        """Make a mesh of the tetrahedra of a pyvista or VTK grid; if it has none, of its triangles.
 
-        Cells keep their order, inverted ones are turned (two of their nodes change places), and nodes that no cell uses
-        are left out. Vertices and lines, and triangles beside tetrahedra, are left out. Of quadratic cells the corners
-        are taken, so that curved edges become straight. Data are not taken: `grid.cell_data` fits if the grid has no
-        other cells, `grid.point_data` if each of its nodes is a corner of one.
+        Cells keep their order, and inverted ones are reoriented (two of their nodes are swapped). Unused nodes,
+        vertices, lines, and triangles beside tetrahedra are dropped. Quadratic cells keep only their corners, so that
+        curved edges become straight. Data are not copied: `grid.cell_data` fits if the grid has no other cells,
+        `grid.point_data` if each of its nodes is a corner of a cell.
 
         Parameters
         ----------
         grid : pyvista.DataSet
-            Such as an `UnstructuredGrid`, or a `PolyData` of triangles in the plane z = 0.
+            For example an `UnstructuredGrid`, or a `PolyData` of triangles in the plane z = 0.
 
         Returns
         -------
@@ -226,22 +227,22 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_meshio(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> meshio.Mesh:
-        """The mesh for meshio, with data, as one block of triangles or tetrahedra.
+        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra.
 
         Parameters
         ----------
         cell_data, point_data : dict of arrays, optional
-            Numbers by name, a row a cell, or a row a node.
+            Numbers by name, one row per cell or per node.
 
         Returns
         -------
         meshio.Mesh
-            A copy; of a 2-D mesh its points have two coordinates. Nodes and cells keep their order.
+            A copy; points of a 2-D mesh have two coordinates. Nodes and cells keep their order.
 
         Raises
         ------
         InputError
-            Data that are no numbers, or have other numbers of rows.
+            Data that are not numbers, or with the wrong number of rows.
 
         Examples
         --------
@@ -253,9 +254,9 @@ class Mesh:
 
     @classmethod
     def from_meshio(cls, mesh: meshio.Mesh) -> Mesh:
-        """The tetrahedra of one of meshio's meshes, block by block; without any, its triangles.
+        """Make a mesh of the tetrahedra of a meshio mesh, block by block; if it has none, of its triangles.
 
-        What is taken, turned and left out is as with `from_pyvista`.
+        Cells are chosen, reoriented and dropped as in `from_pyvista`.
 
         Parameters
         ----------
@@ -269,7 +270,7 @@ class Mesh:
         Raises
         ------
         InputError
-            As `from_pyvista`.
+            As for `from_pyvista`.
 
         Examples
         --------
@@ -281,7 +282,7 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_skfem(self) -> skfem.Mesh:
-        """The mesh for scikit-fem; `Model.to_skfem` has the sets, too.
+        """Convert the mesh to scikit-fem; `Model.to_skfem` includes the sets.
 
         Returns
         -------
@@ -303,9 +304,9 @@ class Mesh:
 
     @classmethod
     def from_skfem(cls, mesh: skfem.Mesh) -> Mesh:
-        """One of scikit-fem's meshes of triangles or tetrahedra; of quadratic ones the corners.
+        """Make a mesh of a scikit-fem mesh of triangles or tetrahedra; quadratic cells keep only their corners.
 
-        What is turned and left out is as with `from_pyvista`.
+        Cells are reoriented and nodes dropped as in `from_pyvista`.
 
         Parameters
         ----------
@@ -331,19 +332,19 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """The boundary of a 3-D mesh for trimesh, as it is in the mesh.
+        """Convert the boundary of a 3-D mesh to trimesh, as it is in the mesh.
 
-        Where cells touch in an edge or a node alone, this is no manifold; `tetopt.extract_surface` parts them.
+        Where cells touch only in an edge or a node, it is not a manifold; `tetopt.extract_surface` parts them.
 
         Returns
         -------
         trimesh.Trimesh
-            Of the boundary's nodes, in the mesh's order; its triangles have their normals out.
+            The boundary's nodes, in the mesh's order, and triangles with outward normals.
 
         Raises
         ------
         InputError
-            A 2-D mesh, whose boundary are edges.
+            A 2-D mesh, whose boundary consists of edges.
 
         Examples
         --------
@@ -353,7 +354,7 @@ class Mesh:
         (True, 0.166667)
         """
         if self.ndim != 3:
-            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary are edges")
+            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary consists of edges")
         from tetopt.geometry.topology import boundary_facets
 
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
@@ -367,7 +368,7 @@ def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -
     expected = (len(numbered_edges(cells)[0]), n)
     if places.shape != expected or not np.isfinite(places).all():
         raise InputError(
-            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, a row for each edge, got {places.shape}"
+            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, one row per edge, got {places.shape}"
         )
     places.setflags(write=False)
     return places

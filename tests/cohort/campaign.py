@@ -36,7 +36,7 @@ FAILURES = {
     "mask beside the image": (1, ("failed", "far.nii.gz"), False),
     "labels beside the image": (1, ("failed", "far.nii.gz"), False),
     "damaged header": (1, ("failed", "image.nii"), False),
-    "requirement violated": (2, ("violated", "overlap only by Dice"), False),
+    "requirement violated": (2, ("violated", "overlap with a Dice of only"), False),
     "killed always": (1, ("failed", "SIGKILL"), True),
     "killed once": (1, ("done", ""), False),
     "disk full": (1, ("failed", "File too large"), True),

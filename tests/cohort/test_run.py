@@ -100,7 +100,7 @@ def test_a_mesh_that_violates_a_requirement_is_a_mesh(job, tmp_path):
     words = (f"--mask={tmp_path}/mask.nii.gz", *WORDS, str(tmp_path / "thin.nii.gz"))
     ended = run_subject(job._replace(words=words))
     assert ended.status == "violated"
-    assert "overlap only by Dice" in ended.reason
+    assert "overlap with a Dice of only" in ended.reason
     assert subject_folder(tmp_path / "out", "sub-1").is_dir()
     assert not failure_path(tmp_path / "out", "sub-1").exists()
 

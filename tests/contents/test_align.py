@@ -192,11 +192,11 @@ def test_masks_that_are_none():
         return message(resample_mask, "m.nii", tetopt.Image(data, affine), image)
 
     assert message(resample_mask, "m.nii", tetopt.Image(np.ones((4, 3))), image) == (
-        "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); pick one volume or slice"
+        "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); select one volume or slice"
     )
     labels = np.arange(24).reshape(4, 3, 2)
     what = "m.nii: expected a mask, 0 and one other value or fractions from 0 to 1, got "
-    todo = "; write the one that you mean as 0 and 1 first"
+    todo = "; convert it to 0 and 1 first"
     assert said(labels) == what + "24 values from 0 to 23 (0, 1, 2, 3, 4, ...)" + todo
     assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
     assert said(labels % 2 + 1) == what + "2 values from 1 to 2 (1, 2)" + todo
@@ -206,13 +206,13 @@ def test_masks_that_are_none():
     assert said(labels / 64) == empty + "fractions up to 0.359375"
     away = image.affine @ _translation(10, 0, 0)
     assert said(labels % 2, away) == (
-        "m.nii: nothing of the mask lies in the image's box; it spans 19.0..27.0 x -0.5..2.5 x -0.5..1.5 mm, the "
+        "m.nii: the mask lies outside the image's box; it spans 19.0..27.0 x -0.5..2.5 x -0.5..1.5 mm, the "
         "image -1.0..7.0 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
     )
     # The boxes overlap, but only where the mask is 0, or a fraction under the half.
     half = image.affine @ _translation(2, 0, 0)
-    assert said((labels >= 12) * 1, half).startswith("m.nii: nothing of the mask lies in")
-    assert said(np.where(labels >= 12, 1.0, 0.25), half).startswith("m.nii: nothing of the mask lies in")
+    assert said((labels >= 12) * 1, half).startswith("m.nii: the mask lies outside")
+    assert said(np.where(labels >= 12, 1.0, 0.25), half).startswith("m.nii: the mask lies outside")
 
 
 def test_labels_that_are_none():
@@ -223,7 +223,7 @@ def test_labels_that_are_none():
 
     labels = np.arange(24).reshape(4, 3, 2)
     assert said(labels[0]) == (
-        "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); pick one volume or slice"
+        "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
     )
     for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 32_768, "32768")):
         assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767, .* the first {value} at", said(bad))
@@ -233,8 +233,7 @@ def test_labels_that_are_none():
         "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
     )
     assert said(labels * 0 + 7) == (
-        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; there is nothing to tell apart, "
-        "leave it out or take another file"
+        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit it or use another file"
     )
 
 
@@ -256,7 +255,7 @@ def test_a_contrast_covers_half_of_the_image():
         "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
     )
     assert message(resample_contrast, "t2", tetopt.Image(other[0]), image) == (
-        "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); pick one volume or slice"
+        "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
     )
 
 
@@ -318,15 +317,18 @@ def test_background_of_one_value_is_exact():
 
 def test_images_without_background():
     rng = np.random.default_rng(7)
-    auto, todo = r"^`background` auto: no background found, ", "; give a value, or leave it out$"
+    auto, todo = r"^`background` auto: no background found, as ", "; give a value or omit `background`$"
     for image, words in (
-        (rng.normal(100.0, 20.0, (20, 20, 20)), r"the dark voxels on the faces of the box spread up to .*, not under"),
+        (
+            rng.normal(100.0, 20.0, (20, 20, 20)),
+            r"the dark voxels on the faces of the box range up to .*, which is not below",
+        ),
         (np.full((5, 5), 4.0), "every voxel has the value 4"),
         (
             np.where(ball((20, 20), 5), np.nextafter(1.0, 2.0), 1.0),
-            "classes: expected intensities that 256 bins can part",
+            "classes: expected intensities that 256 bins can separate",
         ),
-        (np.where(ball((20, 20), 5), 0.0, 9.0), "no voxel on the faces of the box is among the dark ones, up to 4.5"),
+        (np.where(ball((20, 20), 5), 0.0, 9.0), r"no voxel on the faces of the box is dark \(4.5 or less\)"),
         (np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0), r"99\.99 % of the voxels would be foreground"),
         (np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0), r"0\.0125 % of the voxels would be foreg"),
     ):
@@ -335,9 +337,9 @@ def test_images_without_background():
 
 def test_levels_that_leave_nothing():
     image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
-    todo = "; give a level between the background's and the tissue's values, the image holds 10 to 90"
+    todo = "; choose a level between the background's and the tissue's values (the image ranges from 10 to 90)"
     assert message(foreground_mask, image, 5) == "`background` 5: every voxel is foreground" + todo
-    assert message(foreground_mask, image, 90) == "`background` 90: nothing is left" + todo
+    assert message(foreground_mask, image, 90) == "`background` 90: no voxel is foreground" + todo
     # A level given is taken at its word, however little it leaves.
     data = np.zeros((40, 40))
     data[20, 20] = 1.0

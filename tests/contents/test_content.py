@@ -196,15 +196,21 @@ def test_float_labels_take_some_bytes_a_voxel():
         ({"images": []}, "images: expected one or more, got none"),
         ({"weights": [1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]"),
         ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got"),
-        ({"weights": [0.0, 0.0, 0.0]}, "weights: nothing that differs between voxels counts; give one above 0"),
-        ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: no voxel has a half or more, there is nothing to mesh"),
-        ({"mask": tetopt.Image(np.ones((12, 13, 15)))}, "mask: expected all of shape (12, 13, 14), got (12, 13, 15)"),
-        ({"images": contrasts()[0], "weights": [0.0]}, "weights: nothing that differs between voxels counts"),
+        ({"weights": [0.0, 0.0, 0.0]}, "weights: every image or label that varies has weight 0; give at least one"),
+        ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: expected voxels of 0.5 or more, got none"),
+        (
+            {"mask": tetopt.Image(np.ones((12, 13, 15)))},
+            "mask: expected shape (12, 13, 14) like the first, got (12, 13, 15)",
+        ),
+        ({"images": contrasts()[0], "weights": [0.0]}, "weights: every image or label that varies has weight 0"),
         ({"weights": [1.0, 1e200, 1.0]}, "weights: expected one for each of 3 images"),
-        ({"labels": tetopt.Image(np.full((12, 13, 14), 3.0))}, "labels: the same everywhere in what is meshed"),
+        (
+            {"labels": tetopt.Image(np.full((12, 13, 14), 3.0))},
+            "labels: expected two or more labels in the meshed region",
+        ),
         ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
         ({"label_weight": -1.0}, "label_weight: expected 0 or 0.001 to 1000, got -1.0"),
-        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected voxels in the same place"),
+        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected the same voxel grid"),
     ],
 )
 def test_refused(change, message):

@@ -409,10 +409,10 @@ def test_shipped_phantom(name):
     ("old", "new", "message"),
     [
         ("name = ", "name ", "expected TOML, got Expected '=' after a key .*; mend that place"),
-        ("size_mm = [20, 20]", "", "missing size_mm; every one of name, description, size_mm, voxel_mm"),
+        ("size_mm = [20, 20]", "", "missing size_mm; name, description, size_mm, voxel_mm"),
         ('name = "test"\nd', 'd = "x"\nd', "missing name; "),
-        ("voxel_mm = 1", "voxel_mm = 1\nvoxels = 3", "unknown 'voxels'; the keys known here are name, desc"),
-        ('"test"', "3", "name: expected a text in quotes, got 3"),
+        ("voxel_mm = 1", "voxel_mm = 1\nvoxels = 3", "unknown 'voxels'; the keys allowed here are name, desc"),
+        ('"test"', "3", "name: expected a quoted string, got 3"),
         ("[20, 20]", "[20]", "size_mm: expected a list of 2 or 3 numbers, one per axis, got \\[20\\]"),
         ("[20, 20]", "[20, 0]", "size_mm: expected lengths above 0 mm, got \\[20.0, 0.0\\]"),
         ("voxel_mm = 1", "voxel_mm = 0", "voxel_mm: expected lengths above 0 mm, got \\[0.0, 0.0\\]"),
@@ -423,14 +423,14 @@ def test_shipped_phantom(name):
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0]]", "axes: expected 2 rows, the directions of the"),
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0], [1]]", "axes: row 2: expected a list of 2 numbers"),
         ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 1], [2, 2]]", "axes: the directions .* do not span 2-D"),
-        ("{ intensity = 10, label = 0 }", "10", "background: expected a table, got 10; write for example"),
-        ("{ intensity = 10, label = 0 }", "{ label = 0 }", "background: missing intensity; every one of"),
+        ("{ intensity = 10, label = 0 }", "10", "background: expected a table, got 10; for example"),
+        ("{ intensity = 10, label = 0 }", "{ label = 0 }", "background: missing intensity; intensity"),
         ("label = 0", "label = -1", "background: label: expected an integer from 0 to 2147483647, got -1"),
-        ("[[shape]]", "[shape]", "shape: expected tables, got .*; begin each shape with \\[\\[shape\\]\\]"),
+        ("[[shape]]", "[shape]", "shape: expected tables, got .*; start each shape with \\[\\[shape\\]\\]"),
         ('"ellipsoid"', '"sphere"', "shape 1: kind: expected one of ellipsoid, box, layer, got 'sphere'"),
         ('kind = "ellipsoid"', 'kind = "layer"', "shape 1: layer: missing normal, offset_mm, thickness_mm;"),
-        ("radii_mm", "radius_mm", "shape 1: ellipsoid: missing radii_mm; every one of kind, intensity"),
-        ("label = 1", "label = 1\ncolor = 1", "shape 1: ellipsoid: unknown 'color'; the keys known here"),
+        ("radii_mm", "radius_mm", "shape 1: ellipsoid: missing radii_mm; kind, intensity"),
+        ("label = 1", "label = 1\ncolor = 1", "shape 1: ellipsoid: unknown 'color'; the keys allowed here"),
         ("[0, 0]", "[0, 0, 0]", "shape 1: center_mm: expected a list of 2 numbers, all finite, got \\[0"),
         ("radii_mm = 5", "radii_mm = -5", "shape 1: radii_mm: expected lengths above 0 mm, got \\[-5.0"),
         ("= 1\n", "= 1\nrotation_deg = [1, 2, 3]\n", "shape 1: rotation_deg: expected a finite number, got"),
@@ -456,7 +456,7 @@ def test_messages_of_a_file(old, new, message, made, tmp_path):
         ({"normal": [0, 1], "offset_mm": "nan", "thickness_mm": 1}, "offset_mm: expected a finite number"),
         (
             {"normal": [0, 1], "offset_mm": 0, "thickness_mm": 1, "rotation_deg": 5},
-            "layer: unknown 'rotation_deg'; the keys known here are kind, intensity, label, normal",
+            "layer: unknown 'rotation_deg'; the keys allowed here are kind, intensity, label, normal",
         ),
     ],
 )
@@ -474,12 +474,12 @@ def test_message_of_an_unknown_name_lists_the_known():
     with pytest.raises(InputError) as caught:
         load_phantom("spere")
     assert str(caught.value) == (
-        f"phantom 'spere': no such phantom; give one of {', '.join(SHIPPED)}, or the path of a .toml file"
+        f"phantom 'spere': no such phantom; use one of {', '.join(SHIPPED)}, or the path of a .toml file"
     )
 
 
 def test_messages_of_a_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or give one of the names constant"):
+    with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or use one of the names constant"):
         load_phantom(tmp_path / "nothing.toml")
     with pytest.raises(InputError, match=r"no such file, it is a folder"):
         load_phantom(tmp_path)
@@ -509,7 +509,7 @@ def test_messages_of_rendering(options, message):
     ("points", "message"),
     [
         ([0.0, 0.0], "points: expected shape \\(..., 3\\), got \\(2,\\); give 3 world coordinates in mm"),
-        ([0.0, 0.0, math.nan], "points: some are NaN or infinite; leave those out"),
+        ([0.0, 0.0, math.nan], "points: some are NaN or infinite; remove those points"),
     ],
 )
 def test_messages_of_points(points, message):

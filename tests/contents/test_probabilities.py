@@ -116,13 +116,13 @@ def test_sums_above_1_are_told_and_divided():
     np.testing.assert_allclose(rows.sum(axis=0), 1.0, rtol=1e-6)
     np.testing.assert_allclose(rows[:, 0, 0, 0], [0.0, 0.5, 0.5])
     np.testing.assert_allclose(rows[:, 0, 0, 2], [0.3, 0.5, 0.2], rtol=1e-6)
-    with pytest.warns(UserWarning, match=r"sum to more than 1 in 1 of 3 voxels, to 1.2 at most; they are divided"):
+    with pytest.warns(UserWarning, match=r"sum to more than 1 in 1 of 3 voxels \(up to 1.2\); they are divided"):
         tetopt.content(tetopt.Image(np.arange(3.0)[None, None]), tissues=tissues, smooth_interfaces=0)
 
 
 def test_bytes_are_taken_as_such():
     image = tetopt.Image(np.zeros((2, 2)))
-    with pytest.warns(UserWarning, match="grey: whole numbers to 204, taken as probabilities times 255"):
+    with pytest.warns(UserWarning, match="grey: whole numbers up to 204, read as probabilities times 255"):
         moved = tetopt.resample_tissue(tetopt.Image(np.array([[0.0, 51.0], [204.0, 3.0]])), image, "grey")
     np.testing.assert_allclose(moved.data, [[0.0, 0.2], [0.8, 3.0 / 255.0]], rtol=1e-6)
 
@@ -130,7 +130,7 @@ def test_bytes_are_taken_as_such():
 @pytest.mark.parametrize("high", [100.0, 2.0, 256.0, 200.5, 1.01])
 def test_other_scales_are_refused(high):
     image = tetopt.Image(np.array([[0.0, high]]))
-    with pytest.raises(InputError, match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; divide by"):
+    with pytest.raises(InputError, match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; first divide by"):
         tetopt.resample_tissue(image, image, "c1")
 
 
@@ -193,7 +193,7 @@ def test_the_same_on_any_number_of_threads():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"labels": True}, "labels and tissues: give one of them"),
+        ({"labels": True}, "labels and tissues: expected at most one"),
         ({"tissues": []}, "tissues: expected one image or more, got 0"),
         ({"tissues": (2.0, 1.0)}, "tissues, number 1: expected probabilities from 0 to 1, got 0 to 2"),
         ({"tissues": (1.0, -1.0)}, "tissues, number 2: expected probabilities from 0 to 1, got -1 to"),
@@ -216,14 +216,14 @@ def test_refused(change, match):
 
 def test_tissues_of_another_shape_or_place_are_refused():
     image, tissues, _ = blurred(12)
-    with pytest.raises(InputError, match=r"number 2: expected shape \(12, 12, 12\) as the first, got \(11, 12, 12\)"):
+    with pytest.raises(InputError, match=r"number 2: expected shape \(12, 12, 12\) like the first, got \(11, 12, 12\)"):
         tetopt.content(image, tissues=[tissues[0], tetopt.Image(tissues[1].data[1:])])
     moved = [tetopt.Image(tissue.data, np.diag([1.0, 1.0, 1.1, 1.0])) for tissue in tissues]
-    with pytest.raises(InputError, match="number 1: expected voxels in the same place"):
+    with pytest.raises(InputError, match="number 1: expected the same voxel grid"):
         tetopt.content(image, tissues=moved)
 
 
 def test_a_tissue_that_is_nowhere_the_most_probable_is_named():
     image, tissues, _ = blurred(12)
-    with pytest.warns(UserWarning, match="in no voxel the most probable: number 3"):
+    with pytest.warns(UserWarning, match="most probable in no voxel: number 3"):
         tetopt.content(image, tissues=[*tissues, tetopt.Image(0.1 * tissues[0].data)])

@@ -129,13 +129,13 @@ def test_runs_are_watched():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"mode": "coarse"}, "expected a mode of graded, uniform, paper, start, got 'coarse'"),
+        ({"mode": "coarse"}, "expected mode graded, uniform, paper, start, got 'coarse'"),
         ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, but no kind"),
         ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, but no sizes"),
         ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, but no nodes"),
-        ({"mode": "uniform"}, "a number of nodes or a spacing, one of them"),
-        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "a number of nodes or a spacing, one of them"),
-        ({"mode": "start"}, "needs a mesh to start from"),
+        ({"mode": "uniform"}, "give exactly one of nodes and spacing"),
+        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give exactly one of nodes and spacing"),
+        ({"mode": "start"}, "requires a mesh to start from"),
     ],
 )
 def test_contradictions(arguments, words):
@@ -157,5 +157,5 @@ def test_an_argument_of_another_name_is_named(arguments, words):
 
 
 def test_the_paper_takes_one_image():
-    with pytest.raises(tetopt.InputError, match="one image and its whole box"):
+    with pytest.raises(tetopt.InputError, match="one image, without labels or mask"):
         tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")

@@ -36,7 +36,7 @@ def test_the_minimum_dihedral_angle(whole):
     assert list(words) == ["min_dihedral"]
     angles = tetopt.geometry.simplex.dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
     assert words["min_dihedral"].startswith(
-        f"{(angles < 60.0).sum()} of {len(angles)} cells have an angle under 60 degrees"
+        f"{(angles < 60.0).sum()} of {len(angles)} cells have a dihedral angle below 60 degrees"
     )
     unmoved = result._replace(history=result.history[:1])
     assert violated(image, unmoved, 60.0) == {}

@@ -180,7 +180,7 @@ def test_nothing_to_solve():
     with pytest.raises(InputError) as error:
         conditioning(pressed.system)
     assert str(error.value) == (
-        "conditioning: every node is fixed or pushed, so there is nothing to solve; take a finer mesh"
+        "conditioning: every node is fixed or pushed, so there is nothing to solve; use a finer mesh"
     )
 
 
@@ -200,6 +200,6 @@ def test_no_convergence_is_an_error():
     # As bad a preconditioner as can be: the matrix itself.
     ill = system(2, (30, 30), contrast=1e6).K_ff
     with pytest.raises(
-        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge: a solve did not$"
+        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge, as a solve did not$"
     ):
         lambda_min(ill, ill)

@@ -179,7 +179,7 @@ def test_averaged_keeps_box_and_mean():
     by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
     np.testing.assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
     np.testing.assert_array_equal(averaged(image, image.shape).data, image.data)
-    with pytest.raises(tetopt.InputError, match="averaged: expected up to"):
+    with pytest.raises(tetopt.InputError, match="averaged: expected at most"):
         averaged(image, (8, 10, 9))
 
 

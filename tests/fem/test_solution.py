@@ -363,9 +363,8 @@ def test_any_number_of_free_pieces_on_springs():
         solve(model._replace(loads=(model.loads[0], model.loads[2])))
     n_cells = len(mesh.cells)
     assert str(error.value) == (
-        f"mesh: 1 components have no node that is held, pushed or on a spring, the first has {n_cells} cells around "
-        f"cell "
-        f"{n_cells} (node {pair.cells[n_cells, 0]}); hold it or take it out"
+        f"mesh: 1 components have no node that is fixed, displaced or on a spring; the first has {n_cells} cells "
+        f"around cell {n_cells} (node {pair.cells[n_cells, 0]}); fix it or remove it"
     )
 
 
@@ -492,19 +491,19 @@ def test_what_cannot_be_solved():
     model = model_with(mesh, sets, loads, 1, young=2.0, nu=0.3, density=1.0)
     assert refused(model, 3) == "step: expected 1 to 2, got 3"
     assert refused(model, 0) == "step: expected 1 to 2, got 0"
-    assert refused(model._replace(materials=None)) == "model: its cells have no moduli; give `young`"
+    assert refused(model._replace(materials=None)) == "model: the cells have no moduli; give `young`"
     weightless = model._replace(materials=model.materials._replace(density=None))
     assert refused(weightless) == "gravity: the cells have no density; give `density`, kg/m3, such as 1000"
     other = model._replace(loads=(*model.loads, Load("torque", "superior", np.ones(3))))
     assert refused(other) == 'load: expected displacement, pressure, traction, spring or gravity, got "torque"'
     adrift = model._replace(loads=model.loads[1:])
     assert refused(adrift) == (
-        "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
-        "hold:SET and spring:SET:K do"
+        "mesh: it can move freely, as no displacement or spring constrains it; fix or support at least one set, "
+        "as hold:SET and spring:SET:K do"
     )
     sliding = model_with(mesh, sets, ["move:inferior:free,free,0", "pressure:superior:1"], 1, young=2.0)
     assert refused(sliding).startswith(f"mesh: {len(mesh.cells)} cells around cell 0 ")
-    assert "can still turn or slide as a whole" in refused(sliding)
+    assert "can still rotate or slide as a whole" in refused(sliding)
 
 
 def test_forces_that_do_not_balance_are_an_error(monkeypatch):
@@ -519,7 +518,9 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
         return system._replace(K=system.K + leak, K_ff=system.K_ff + leak[system.free][:, system.free])
 
     monkeypatch.setattr(module, "constrained", with_leak)
-    with pytest.raises(RuntimeError, match=r"^elasticity: forces and reactions do not balance, .* mN are left where"):
+    with pytest.raises(
+        RuntimeError, match=r"^elasticity: forces and reactions do not balance: the remainder .* mN exceeds"
+    ):
         solve(model)
 
 

@@ -28,10 +28,10 @@ def test_sound(n):
 
 def test_faults(mesh):
     points, cells = mesh.points, mesh.cells
-    assert problems(np.vstack([points, [[0, 0, 0]]]), cells) == f"nodes that no cell uses: 1, the first [{len(points)}]"
+    assert problems(np.vstack([points, [[0, 0, 0]]]), cells) == f"unused nodes: 1, the first [{len(points)}]"
     split = np.where(np.arange(len(cells))[:, None] < 1, np.where(cells == cells[0, 0], len(points), cells), cells)
-    assert "pairs of nodes in one place: 1" in problems(np.vstack([points, points[cells[0, 0]]]), split)
-    assert "there more than once: 1, the first [0]" in problems(points, np.vstack([cells, cells[0]]))
+    assert "pairs of nodes at the same position: 1" in problems(np.vstack([points, points[cells[0, 0]]]), split)
+    assert "duplicate cells: 1, the first [0]" in problems(points, np.vstack([cells, cells[0]]))
     holed = cells[1:]
     assert "boundary facets off the faces" in problems(points, holed) or "open" in problems(points, holed)
     inner = np.flatnonzero((np.abs(IMAGE.to_index(points) - 3.5) < 2.0).all(axis=1))[0]
@@ -93,9 +93,9 @@ def test_two_cubes_that_touch(corner, words):
     assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False, of_cell=np.ones(len(alone.cells))) == []
     inner = [] if words is None else [words.format("the interface of two labels", " (0 and 1 at 1)", *used[here])]
     assert tetopt.check_mesh(mesh, of_cell=of_cell) == inner
-    with pytest.raises(tetopt.InputError, match="whole number from 0 for each of the mesh's"):
+    with pytest.raises(tetopt.InputError, match="whole number >= 0 for each of the mesh's"):
         tetopt.check_mesh(mesh, of_cell=of_cell[1:])
-    with pytest.raises(tetopt.InputError, match="whole number from 0 for each of the mesh's"):
+    with pytest.raises(tetopt.InputError, match="whole number >= 0 for each of the mesh's"):
         tetopt.check_mesh(mesh, of_cell=of_cell - 0.5)
 
 

@@ -74,9 +74,7 @@ def test_the_bound_is_the_determinant_at_corners():
 
 def test_midpoints_that_a_mesh_does_not_take():
     points, cells = [[0, 0], [1, 0], [0, 1]], [[0, 1, 2]]
-    with pytest.raises(
-        tetopt.InputError, match=r"expected 3 x 2 finite coordinates, a row for each edge, got \(2, 2\)"
-    ):
+    with pytest.raises(tetopt.InputError, match=r"expected 3 x 2 finite coordinates, one row per edge, got \(2, 2\)"):
         tetopt.Mesh(points, cells, [[0, 0], [1, 1]])
     with pytest.raises(tetopt.InputError, match="expected 3 x 2 finite"):
         tetopt.Mesh(points, cells, [[0, 0], [1, 1], [np.nan, 0]])

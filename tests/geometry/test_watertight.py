@@ -256,8 +256,8 @@ def test_parted_sheets_do_not_cross(kind, fraction, seed):
 @pytest.mark.parametrize(
     ("chosen", "words"),
     [
-        ([], "no cell is chosen"),
-        (np.zeros(5, dtype=bool), "no cell is chosen"),
+        ([], "expected at least one cell"),
+        (np.zeros(5, dtype=bool), "expected at least one cell"),
         (np.ones(4, dtype=bool), r"expected a mask of 5 cells, got shape \(4,\)"),
         ([0, 5], r"must lie in 0..4, got 0..5"),
         ([-1], r"must lie in 0..4, got -1..-1"),
@@ -274,5 +274,5 @@ def test_triangles_and_folded_cells_are_refused():
         extract_surface(np.eye(3)[:, :2], np.array([[0, 1, 2]]), [0])
     points = np.vstack([CUBE_CORNER[0], [0.2, 0.2, 2.0], [0.1, 0.1, 3.0]])
     for cells in ([[0, 1, 2, 3], [0, 1, 2, 4]], [[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]]):
-        with pytest.raises(InputError, match="fold over one another"):
+        with pytest.raises(InputError, match="some of the chosen cells overlap"):
             extract_surface(points, np.array(cells), range(len(cells)))

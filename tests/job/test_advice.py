@@ -52,9 +52,9 @@ def test_a_mask_that_the_mesh_does_not_show(said, change, words):
 
 
 def test_what_background_leaves_is_no_mask(said):
-    violated = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
+    violated = {"mask": "the mesh and the mask overlap with a Dice of only 0.5"}
     far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
-    words = "the mesh and the foreground overlap only by Dice 0.5"
+    words = "the mesh and the foreground overlap with a Dice of only 0.5"
     assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, violated=violated), far, "foreground") == {
         "mask": words
     }

@@ -64,11 +64,11 @@ def test_a_bright_voxel_leaves_the_classes_as_they_are(monkeypatch):
     ("values", "classes", "words"),
     [
         ([1.0, 2.0], 1, "2 or more, got 1"),
-        ([1.0, 2.0], 3, "3 asked for, but the values fill only 2"),
+        ([1.0, 2.0], 3, "3 requested, but the values fill only 2"),
         (
             [1.0, np.nextafter(1.0, 2.0)],
             2,
-            "expected intensities that 256 bins can part, got 1.0 to 1.0000000000000002",
+            "expected intensities that 256 bins can separate, got 1.0 to 1.0000000000000002",
         ),
     ],
 )

@@ -69,7 +69,7 @@ def test_only_voxels_in_the_mask_touch():
     mask = tetopt.Image(np.indices(labels.shape)[0] < 11)
     image, mesh, of_cell = blocky(labels)
     assert [each.labels for each in label_contacts(image, mesh, of_cell, mask) if each.voxels_mm2] == [(1, 2)]
-    with pytest.raises(tetopt.InputError, match=r"mask: expected the shape of labels"):
+    with pytest.raises(tetopt.InputError, match=r"mask: expected the labels' shape"):
         label_contacts(image, mesh, of_cell, tetopt.Image(np.ones((3, 3, 3))))
 
 

@@ -163,7 +163,7 @@ def spoiled(value, dtype=np.float32):
     ("data", "words"),
     [
         (spoiled(np.nan), r"2 voxels are NaN or infinite, the first at index \(7, 3, 5\)"),
-        (spoiled(1e160, np.float64), "squares overflow"),
+        (spoiled(1e160, np.float64), "squares would overflow"),
         (noisy((12, 12, 12), np.complex64), "complex"),
         (np.zeros((12, 12, 12), dtype=[("R", "u1"), ("G", "u1")]), "RGB"),
     ],
@@ -180,7 +180,7 @@ def test_voxels_that_no_image_takes(data, words, monkeypatch):
 @pytest.mark.parametrize("sizes", [tetopt.Sizes(edge_size=5.0), tetopt.Sizes(field=tetopt.Image(np.ones((2, 2, 2))))])
 def test_targets_take_voxels_in_memory(sizes):
     voxels = Recorded(noisy((12, 12, 12), np.uint8))
-    with pytest.raises(tetopt.InputError, match=r"largest and field .* this one is stored; use smallest, longest"):
+    with pytest.raises(tetopt.InputError, match=r"largest and field .* this image is stored; use smallest, longest"):
         octree_mesh(tetopt.Image.stored(voxels), 100, sizes)
     assert voxels.reads == []
 

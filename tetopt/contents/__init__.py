@@ -1,1 +1,1 @@
-"""What the mesh is to represent."""
+"""The content that a mesh represents: images, labels and masks."""

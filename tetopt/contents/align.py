@@ -1,7 +1,7 @@
-"""What belongs to an image, brought onto its voxels: masks, labels, further contrasts; and what is not background.
+"""Resample masks, labels and further contrasts to an image's voxels, and separate foreground from background.
 
 Two files of one patient need not share their voxels, only the world: they are matched by their affines, never by
-their shapes. The domain of a grid is the box of its voxels, index -0.5 to shape - 0.5, as everywhere here.
+their shapes. The domain of a grid is the box of its voxels, from index -0.5 to shape - 0.5.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
-LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, that a further contrast has to cover
-BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median: what still counts as background
-MAD_TO_SIGMA = 1.4826  # of a normal distribution: its sigma over its median absolute deviation
-SMALL_COMPONENT_FRACTION = 0.01  # of the largest piece's voxels: pieces with fewer do not count
-LEAST_CLASS_FRACTION = 0.001  # of the voxels: a background or foreground with fewer, found without a level, is none
+LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
+BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median, up to which voxels count as background
+MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
+SMALL_COMPONENT_FRACTION = 0.01  # of the largest component's voxels: smaller components are ignored
+LEAST_CLASS_FRACTION = 0.001  # of the voxels: a background or foreground found without a level must have more
 
 
 def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
-    """The mask on the image's voxels; nearest neighbour by the affines where it is on another grid, 0 outside of it.
+    """Resample a mask to the image's voxels: nearest neighbour by the affines if the grids differ, 0 outside its box.
 
     Parameters
     ----------
     mask : Image
-        Either two values, 0 and any other above it (bool, 0 and 255), or fractions in [0, 1], a probability map
-        whose level 0.5 counts as the border. One value above 0 everywhere is a mask too: the whole box.
+        Either two values, 0 and another above 0 (bool, 0 and 255), or fractions in [0, 1], a probability map
+        whose border is the level 0.5. A single value above 0 is a mask, too: the whole box.
     image : Image
-        Whose voxels are taken.
+        Image with the target voxels.
     name : str, optional
-        What the mask is called in messages, for example its file.
+        Name of the mask in messages, for example its file.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     Raises
     ------
     InputError
-        Another number of axes than the image, other values, nothing inside, or nothing of it in the image's box.
+        A number of axes different from the image's, other values, an empty mask, or a mask outside the image's box.
 
     Examples
     --------
@@ -62,32 +62,32 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     inside = _mask_values(name, mask.data)
     moved = _moved(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
-        raise InputError(f"{name}: nothing of the mask lies in the image's box; {_both_boxes(mask, image)}")
+        raise InputError(f"{name}: the mask lies outside the image's box; {_both_boxes(mask, image)}")
     return Image(moved, image.affine)
 
 
 def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
-    """The labels on the image's voxels; nearest neighbour by the affines where they are on another grid, 0 outside.
+    """Resample labels to the image's voxels: nearest neighbour by the affines if the grids differ, 0 outside their box.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background.
     image : Image
-        Whose voxels are taken.
+        Image with the target voxels.
     name : str, optional
-        What the labels are called in messages.
+        Name of the labels in messages.
 
     Returns
     -------
     Image
-        Whole numbers as float32, the image's shape and affine.
+        Whole numbers as float32, with the image's shape and affine.
 
     Raises
     ------
     InputError
-        Another number of axes than the image, values that are not such numbers, no label above 0 in the image's box,
-        or one value everywhere in it.
+        A number of axes different from the image's, invalid labels, no label above 0 in the image's box, or a single
+        label in it.
 
     Examples
     --------
@@ -106,25 +106,24 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
     if moved.min() == top:
         raise InputError(
-            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; there is nothing to tell "
-            "apart, leave it out or take another file"
+            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit it or use another file"
         )
     return Image(moved, image.affine)
 
 
 def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Image:
-    """A further contrast on the image's voxels; linear by the affines where it is on another grid.
+    """Resample a further contrast to the image's voxels: linear by the affines if the grids differ.
 
-    Outside of its box the nearest value goes on.
+    Outside its box the nearest value continues.
 
     Parameters
     ----------
     other : Image
         Intensities.
     image : Image
-        Whose voxels are taken.
+        Image with the target voxels.
     name : str, optional
-        What the contrast is called in messages.
+        Name of the contrast in messages.
 
     Returns
     -------
@@ -134,11 +133,11 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     Raises
     ------
     InputError
-        Another number of axes than the image, or less than half of the image's voxel centres in its box.
+        A number of axes different from the image's, or a box with fewer than half of the image's voxel centres.
 
     See Also
     --------
-    content : Takes contrasts on the same voxels.
+    content : Combine contrasts on the same voxels.
 
     Examples
     --------
@@ -160,17 +159,17 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
 
 
 def foreground_mask(image: Image, level: float | None = None) -> Image:
-    """0/1 mask of what is not background.
+    """Mask of the foreground, 0 and 1.
 
-    Background are the voxels not above the level that hang together, face to face, with the border of the box: dark
-    cavities inside stay in. Pieces of it with less than a hundredth of the largest one's voxels are not background:
-    vessels, bone and gas that a face of the box cuts through. Likewise pieces of the foreground that small are
-    dropped: noise, tubes.
+    The background consists of the voxels at or below the level that are connected by faces to the border of the box,
+    so dark cavities inside remain foreground. Its components with less than 1/100 of the largest one's voxels, such as
+    vessels, bone and gas cut by a face of the box, are foreground. Components of the foreground that are as small,
+    such as noise and tubes, are dropped.
 
     Parameters
     ----------
     image : Image
-        Brighter than its background.
+        An image brighter than its background.
     level : float, optional
         `background_level` by default.
 
@@ -203,25 +202,25 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
     if level is None:
         raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = image.range
-    outcome = "every voxel is foreground" if fraction > 0.5 else "nothing is left"
+    outcome = "every voxel is foreground" if fraction > 0.5 else "no voxel is foreground"
     raise InputError(
-        f"`background` {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
-        f"holds {low:g} to {high:g}"
+        f"`background` {limit:g}: {outcome}; choose a level between the background's and the tissue's values (the "
+        f"image ranges from {low:g} to {high:g})"
     )
 
 
 def background_level(image: Image) -> float:
-    """The highest intensity of the background, from what lies on the faces of the box.
+    """The highest intensity of the background, estimated on the faces of the box.
 
-    Of the voxels on the faces the darker ones by Otsu's threshold of the whole image are background, most of them at
-    least: a face may cut the body. Its level is their median and 4 sigma, sigma from the median absolute deviation,
-    to which body on the faces does little (Hampel, The influence curve and its role in robust estimation, JASA 69,
-    1974). A background of one value, as around an extracted brain, has that value for level.
+    Voxels on the faces that are darker than Otsu's threshold of the whole image are mostly background, although a face
+    may cut the body. The level is their median plus 4 sigma, with sigma from the median absolute deviation, which is
+    robust against body on the faces (Hampel, The influence curve and its role in robust estimation, JASA 69, 1974).
+    The level of a constant background, as around an extracted brain, is its value.
 
     Raises
     ------
     InputError
-        No dark voxels on the faces, or such as do not stand apart: a level not under Otsu's threshold.
+        The faces have no dark voxels, or these are not distinct: the level is not below Otsu's threshold.
     """
     data = image.data
     if data.min() == data.max():
@@ -233,31 +232,31 @@ def background_level(image: Image) -> float:
     values = _on_faces(data)
     dark = values[values <= threshold].astype(np.float64)
     if len(dark) == 0:
-        raise _no_background(f"no voxel on the faces of the box is among the dark ones, up to {threshold:.4g}")
+        raise _no_background(f"no voxel on the faces of the box is dark ({threshold:.4g} or less)")
     middle = np.median(dark)
     level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
     if level >= threshold:
         raise _no_background(
-            f"the dark voxels on the faces of the box spread up to {level:.4g}, not under the {threshold:.4g} that "
-            "parts dark from bright"
+            f"the dark voxels on the faces of the box range up to {level:.4g}, which is not below the threshold "
+            f"between dark and bright, {threshold:.4g}"
         )
     return level
 
 
 def _no_background(reason: str) -> InputError:
-    return InputError(f"`background` auto: no background found, {reason}; give a value, or leave it out")
+    return InputError(f"`background` auto: no background found, as {reason}; give a value or omit `background`")
 
 
 def _check_axes(name: str, other: Image, image: Image) -> None:
     if other.ndim != image.ndim:
         raise InputError(
-            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; pick one "
+            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; select one "
             "volume or slice"
         )
 
 
 def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
-    """0 and 1, or fractions, as float32; InputError for what is no mask or an empty one."""
+    """0 and 1, or fractions, as float32; raise InputError for an invalid or empty mask."""
     top = data.max()
     is_top = data == top
     if top > 0 and (is_top | (data == 0)).all():
@@ -267,7 +266,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
         raise InputError(
             f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
-            f"{values[0]:g} to {values[-1]:g} ({some}); write the one that you mean as 0 and 1 first"
+            f"{values[0]:g} to {values[-1]:g} ({some}); convert it to 0 and 1 first"
         )
     if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
@@ -276,12 +275,12 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _moved(other: Image, image: Image) -> NDArray[np.floating]:
-    """Values of `other` at the image's voxel centres: of the voxel around them, 0 outside."""
+    """Values of `other` at the image's voxel centres: those of the voxels that contain them, 0 outside."""
     return other.data if is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
 
 
 def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> bool:
-    """Whether two images have the same voxels, to within 1e-4 voxel; a cropped image has some of the other's."""
+    """True if two images have the same voxels, to 1e-4 voxel; a cropped image has a part of the other's."""
     corners = _corners(image)
     offset = other.to_index(image.to_world(corners)) - corners
     start = np.rint(offset[0]) if is_cropped else np.zeros(image.ndim)
@@ -294,12 +293,12 @@ def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> boo
 def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
     """`data`, on the grid of `other`, at the image's voxel centres.
 
-    Of scipy's modes `grid-constant` fills a grid's outer half voxels from their own voxels, `constant` leaves them out.
+    scipy's mode `grid-constant` fills a grid's outer half voxels from their own voxels; `constant` leaves them out.
     """
     n = image.ndim
     corner = other.to_index(image.to_world(np.vstack([np.zeros(n), np.eye(n)])))
     matrix, offset = (corner[1:] - corner[0]).T, corner[0]
-    if order == 0:  # centres halfway between two voxels, on a grid shifted by half a voxel, all go to the upper one
+    if order == 0:  # on a grid shifted by half a voxel, all centres halfway between two voxels go to the upper one
         offset = offset + SAME_GRID_VOXELS
     return scipy.ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
 
@@ -324,7 +323,7 @@ def _on_faces(data: NDArray) -> NDArray:
 
 
 def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[np.bool_]:
-    """Pieces, connected face to face, not far smaller than the largest; with `at_border` of those that touch it."""
+    """Face-connected components not far smaller than the largest; with `at_border`, only those at the border count."""
     pieces, _ = scipy.ndimage.label(is_in)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0

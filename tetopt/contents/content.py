@@ -1,8 +1,8 @@
-"""What a mesh is to represent: one or several contrasts, labels, a mask, on the voxels of one image.
+"""The content of a mesh: one or several contrasts, labels and a mask on the voxels of one image.
 
-E_D of Eq. (3) is summed over channels: for each contrast its intensities, for labels one channel each that is 1 where
-the label is (one-hot), so that a cell of one value in all channels is one tissue. How much each counts is stated by
-weights: with weight 1 a channel's variance over the domain counts as much as the first image's.
+E_D of Eq. (3) is summed over channels: the intensities of each contrast, and for each label a channel that is 1 within
+it (one-hot), so that a cell with one value in all channels is one tissue. Weights scale the channels: with weight 1, a
+channel's variance over the domain counts as much as the first image's.
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
 
-RARITY_POWER = 0.5  # of a label's fraction of the voxels, by which each of its voxels counts less
-SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
-STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
-WEIGHT_RANGE = 1e-3, 1e3  # the least and the largest weight, besides 0
-MOST_TENSION = 10.0  # voxels; a part of twice the radius would be given up
-SMOOTH_INTERFACES = 0.3  # voxels, the default tension: twice of it is the radius of what it would take away
-# Of the local edge: nodes on a curved surface would cut it off with their facets. 0.1 has more folds, and no more Dice.
+RARITY_POWER = 0.5  # exponent of a label's fraction of the voxels by which its voxels count less
+SAME_PLACE_VOXELS = 1e-2  # voxel centres no farther apart coincide
+STEPS_PER_SIGMA = 256.0  # least number of integer steps in a contrast's standard deviation
+WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight other than 0
+MOST_TENSION = 10.0  # voxels; details of twice this radius would vanish
+SMOOTH_INTERFACES = 0.3  # voxels, the default tension: details up to twice this radius vanish
+# Fraction of the local edge: facets of nodes exactly on a curved surface would cut it off. 0.1 gives more folds, and no
+# higher Dice.
 BAND_FRACTION = 0.05
-MARGIN_VOXELS = 4  # kept around a mask: as far as smoothing its surface, and cells on it, can reach
-WRONG_SIDE_VARIANCES = 4.0  # what a voxel on the wrong side of the region's surface counts, of the variance
-ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
+MARGIN_VOXELS = 4  # margin around a mask: the reach of surface smoothing and of cells on the surface
+WRONG_SIDE_VARIANCES = 4.0  # weight of a voxel on the wrong side of the region's surface, in variances
+ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below this limit, so that 32 bits hold them exactly
 
 
 class Continuation(NamedTuple):
-    """Where values beyond a mask's surface come from; made by `continuation`."""
+    """Source of the values beyond a mask's surface; made by `continuation`."""
 
     part: tuple[slice, ...]  # the voxels around the mask
-    inside: NDArray[np.bool_]  # which of them lie in it
-    nearest: NDArray[np.int64]  # (K,) for each of them outside, in C order, the flat number of the nearest one inside
+    inside: NDArray[np.bool_]  # those that lie in it
+    nearest: NDArray[np.int64]  # (K,) flat index of the nearest voxel inside, for each one outside in C order
 
 
 class Spread(NamedTuple):
-    """Of an image's intensities."""
+    """Spread of an image's intensities."""
 
     mean: float
     low: float
@@ -55,40 +56,40 @@ class Spread(NamedTuple):
 
 
 class SmoothLabels(NamedTuple):
-    """Labels whose interfaces are to be smooth."""
+    """Labels with smooth interfaces."""
 
     memberships: Memberships
-    tension: float  # voxels: how far an interface would move to save itself
-    own_channel: NDArray[np.int64]  # (K,) each label's channel, a row of `values`
-    own_value: NDArray[np.int32]  # (K,) what its voxels have there
-    keeps_volumes: bool  # whether labels thinner than cells keep their volume
-    band: float = BAND_FRACTION  # of the local edge: how far a node may be off the surface between two labels
+    tension: float  # voxels an interface would move to reduce its area
+    own_channel: NDArray[np.int64]  # (K,) channel of each label, a row of `values`
+    own_value: NDArray[np.int32]  # (K,) value of its voxels in that channel
+    keeps_volumes: bool  # True if labels thinner than cells keep their volume
+    band: float = BAND_FRACTION  # fraction of the local edge that a node may be off the surface between two labels
 
 
 class Content(NamedTuple):
-    """What a mesh is to represent; made by `content`.
+    """The content that a mesh represents; made by `content`.
 
     Parameters
     ----------
     image : Image
-        The voxels, and the first contrast; only those around the mask; divided where slices are thick.
+        The voxels and the first contrast, restricted to the surroundings of the mask and divided if slices are thick.
     channels : (C, s_0, ..., s_{n-1}) array, optional
-        What is to be one value in a cell, in one unit, as whole numbers: a channel for each contrast, and channels of
-        the labels. Without them it is the image's own intensities.
+        Values that should be constant in a cell, in one unit, as whole numbers: a channel for each contrast, and
+        channels of the labels. By default the image's intensities.
     n_contrasts : int
-        The first of the channels: images, not labels.
+        Number of leading channels that are images, not labels.
     unit : float
-        Squared intensity of the image for 1 squared of `values`.
+        Squared intensity of the image that corresponds to a squared value of 1 in `values`.
     region : Region or None
-        What is to be covered; None for the image's box.
+        The region to cover; None for the image's box.
     continuation : Continuation, optional
-        Of the mask that the region is of; see `tetopt.contents.content.continued`.
+        Continuation beyond the region's mask; see `tetopt.contents.content.continued`.
     smooth : SmoothLabels, optional
-        Labels whose interfaces are to be smooth.
+        Labels with smooth interfaces.
     keeps_components : bool
         Keep connected components of a mesh that the mask does not have.
     statistics : Statistics, optional
-        Of the image by itself, if a pass over its voxels has taken them.
+        Statistics of the image, if a pass over its voxels has computed them.
 
     Examples
     --------
@@ -111,17 +112,17 @@ class Content(NamedTuple):
 
     @property
     def memberships(self) -> Memberships | None:
-        """Of labels whose interfaces are to be smooth, of each a level."""
+        """Levels of the labels with smooth interfaces, if any."""
         return None if self.smooth is None else self.smooth.memberships
 
     @property
     def is_plain(self) -> bool:
-        """Whether the only channel is the image's own intensities."""
+        """True if the image's intensities are the only channel."""
         return self.channels is None
 
     @property
     def n_channels(self) -> int:
-        """How many channels there are."""
+        """Number of channels."""
         return 1 if self.channels is None else len(self.channels)
 
     @property
@@ -131,22 +132,22 @@ class Content(NamedTuple):
 
     @property
     def inside(self) -> NDArray[np.bool_] | None:
-        """Which voxels are to be covered, if not all."""
+        """Mask of the voxels to cover; None for all."""
         return None if self.region is None else self.region.inside
 
     @property
     def n_voxels(self) -> int:
-        """Voxels to be covered."""
+        """Number of voxels to cover."""
         return prod(self.image.shape) if self.region is None else int(self.region.inside.sum())
 
     @property
     def volume(self) -> float:
-        """What they fill, mm^n."""
+        """Volume to cover, mm^n."""
         return self.n_voxels * self.image.voxel_volume
 
     @property
     def variance(self) -> float:
-        """Variance over the voxels to be covered, of all channels, intensity^2; times `volume`: E_D of one cell."""
+        """Variance of all channels over the voxels to cover, intensity^2; times `volume` it is E_D of a single cell."""
         if self.statistics is not None and self.is_plain and self.region is None:
             return self.statistics.variance
         if self.is_plain and self.region is None:
@@ -155,14 +156,14 @@ class Content(NamedTuple):
 
     @property
     def spread(self) -> Spread:
-        """Of the intensities of the image's voxels, whichever are to be covered."""
+        """Spread of the image's intensities over all of its voxels."""
         if self.statistics is not None:
             return Spread(*self.statistics[:4])
         return Spread(self.image.mean, *self.image.range, self.image.variance)
 
     @property
     def wrong_side(self) -> float:
-        """What a voxel on the wrong side of the region's surface counts, in squared units of `values`."""
+        """Penalty of a voxel on the wrong side of the region's surface, in squared units of `values`."""
         return WRONG_SIDE_VARIANCES * (self.variance / self.unit or 1.0)
 
     @property
@@ -176,52 +177,53 @@ def content(
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
     keep_components: bool = False, keep_volumes: bool = True, tissues: Sequence[Image] | None = None,
 ) -> Content:  # fmt: skip
-    """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree_mesh` or `optimize`.
+    """Combine contrasts, labels and a mask for `mesh_image`, `octree_mesh` or `optimize`.
 
     Parameters
     ----------
     images : Image or sequence of Image
-        Contrasts, all on the voxels of the first (`tetopt.contents.align` puts them there).
+        Contrasts, all on the voxels of the first (`tetopt.contents.align` resamples them).
     labels : Image, optional
         Whole numbers from 0, on the same voxels.
     mask : Image, optional
-        0 to 1 on the same voxels: the mesh covers the region where it is a half or more, and its boundary follows that
-        region's surface (`tetopt.contents.domain`). Outside, images and labels are continued by the nearest value
-        inside, so that what lies beyond the surface has no say.
+        0 to 1 on the same voxels: the mesh covers the region of values of 0.5 or more, and its boundary follows that
+        region's surface (`tetopt.contents.domain`). Outside, images and labels continue with the nearest value inside,
+        so that values beyond the surface are ignored.
     weights : sequence of float, optional
-        One for each image, 1 by default: with 1 an image's variance counts as much as the first's, whatever its scale.
-        0.001 to 1000, or 0, which leaves an image out.
+        Weight of each image, 0.001 to 1000, 1 by default; 0 ignores an image. With weight 1 its variance counts as
+        much as the first image's, whatever its scale.
     label_weight : float
-        Likewise for the labels altogether. Of the labels the rarer count more by voxel.
+        Weight of all labels together. Voxels of rare labels count more.
     smooth_interfaces : float
-        Surface tension of interfaces, voxels: how far one would move to save itself. Labels are then smooth between
-        voxels (`tetopt.contents.memberships`), which are divided where slices are thick; nodes between labels lie where
-        these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
+        Surface tension of interfaces: the distance, in voxels, that an interface would move to reduce its area. Labels
+        are smooth between voxels (`tetopt.contents.memberships`), which are divided if slices are thick, and nodes
+        between labels lie on their interfaces. With 0 labels keep their stairs, and each cell gets the label of most
+        of its voxels.
     keep_components : bool
         Keep connected components of the mesh that the mask does not have. By default small ones are dropped.
     keep_volumes : bool
-        Give labels that are thinner than cells as much volume as their voxels have, by cells of which other labels fill
-        more. With False they lose what cells do not show.
+        Preserve the volume of labels that are thinner than cells by giving them cells that other labels fill more. If
+        False, they lose volume.
     tissues : sequence of Image, optional
-        Probabilities of tissues, 0 to 1 on the same voxels, instead of labels. They are labels 1 to K in this order, 0
-        where what is left is the most probable, and their interfaces lie where two are as probable, within voxels
-        (`tetopt.contents.probabilities`). Where they sum to more than 1 they are divided by that sum, with a warning.
+        Probabilities of tissues, 0 to 1 on the same voxels, instead of labels. They become labels 1 to K in this order,
+        and 0 where the remainder to 1 is larger. Interfaces lie where two are equally probable, within voxels
+        (`tetopt.contents.probabilities`). Probabilities that sum to more than 1 are divided by the sum, with a warning.
 
     Returns
     -------
     Content
-        For `mesh_image`, `octree_mesh` or `optimize`, in place of an image.
+        Input for `mesh_image`, `octree_mesh` or `optimize`, in place of an image.
 
     Raises
     ------
     InputError
-        Images of different shapes, wrong weights, labels that are not whole numbers from 0, probabilities that are not
-        from 0 to 1, labels as well as tissues, nothing that counts.
+        Images of different shapes, invalid weights, labels that are not whole numbers from 0, probabilities outside 0
+        to 1, both labels and tissues, or only images and labels of weight 0.
 
     See Also
     --------
-    resample_contrast, resample_labels, resample_tissue, resample_mask : What lies on other voxels.
-    foreground_mask : A mask of what is not background.
+    resample_contrast, resample_labels, resample_tissue, resample_mask : Resample images on other voxels.
+    foreground_mask : Mask of the foreground.
 
     Examples
     --------
@@ -261,11 +263,9 @@ def content(
         number, codes = _one_hot(labels.data.astype(np.int64), region)
         codes = np.sqrt(label_weight) * codes
         if len(codes) == 0:
-            raise InputError(
-                "labels: the same everywhere in what is meshed, there is nothing to tell apart; leave them out"
-            )
+            raise InputError("labels: expected two or more labels in the meshed region, got one; omit them")
     if len(contrasts) + len(codes) == 0:
-        raise InputError("weights: nothing that differs between voxels counts; give one above 0")
+        raise InputError("weights: every image or label that varies has weight 0; give at least one a weight above 0")
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(
@@ -280,7 +280,7 @@ def content(
 
 
 def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Region:
-    """The region on divided voxels, its surface interpolated between slices as labels are."""
+    """The region on divided voxels, with its surface interpolated between slices like labels."""
     if region.inside.all():
         inside = np.ones([n * factor for n, factor in zip(labels.shape, factors, strict=True)], dtype=bool)
         return Region(inside, np.full(inside.shape, region.level.min(), dtype=np.float32))
@@ -290,7 +290,7 @@ def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Regi
 
 
 def _scaled(images: list[Image], weights: list[float], region: Region | None) -> list[NDArray[np.float32]]:
-    """The contrasts that count less their means, of variance `weight` each."""
+    """The contrasts of weight above 0, minus their means and scaled to variance `weight`."""
     scaled = []
     for image, weight in zip(images, weights, strict=True):
         data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
@@ -305,11 +305,11 @@ def _whole_numbers(
 ) -> tuple[NDArray[np.int32], float]:
     """All channels, (C, *shape), as whole numbers, and their scale.
 
-    If it can be, their sums of squares along a row fit 32 bits.
+    If possible, their sums of squares along a row fit into 32 bits.
     """
     square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
     fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (number.shape[-1] * square)))
-    # Where one voxel, or a rare label, is much larger than the rest, sums are of 64 bits rather than levels few.
+    # If one voxel or a rare label is much larger than the rest, sums take 64 bits, to keep enough levels.
     steps = [STEPS_PER_SIGMA / float(np.std(data, dtype=np.float64)) for data in contrasts]
     largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
     scale = min(max([fitting, *steps]), 2.0**30 / largest)
@@ -322,18 +322,18 @@ def _whole_numbers(
 
 
 def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> list[Image]:
-    """The probabilities of tissues; none if there are none."""
+    """The checked probabilities of tissues; empty if there are none."""
     if tissues is None:
         return []
     if labels is not None:
-        raise InputError("labels and tissues: give one of them")
+        raise InputError("labels and tissues: expected at most one of them, got both")
     check_tissues(tissues)
     warn_of_sums(tissues)
     return list(tissues)
 
 
 def plain(image: Image | Content) -> Content:
-    """An image by itself; a content is returned as it is."""
+    """Content of a single image; a content is returned unchanged."""
     return image if isinstance(image, Content) else Content(image)
 
 
@@ -343,9 +343,9 @@ def _variance(values: NDArray, region: Region | None) -> float:
 
 
 def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
-    """The voxels around a mask, with a margin, and the nearest inside by voxels of these edges (n,), mm.
+    """The voxels around a mask, with a margin, and their nearest voxels inside, for voxel edges (n,) in mm.
 
-    What lies further away takes only time. For images on the same voxels it is found once and handed on.
+    Voxels farther away would only take time. Images on the same voxels share one continuation.
 
     Raises
     ------
@@ -354,7 +354,7 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     """
     inside = mask.data >= INSIDE_FRACTION
     if not inside.any():
-        raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
+        raise InputError("mask: expected voxels of 0.5 or more, got none")
     box = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
     ends = ((max(s.start - MARGIN_VOXELS, 0), s.stop + MARGIN_VOXELS) for s in box)
     part = tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True))
@@ -366,9 +366,9 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
 
 
 def continued(image: Image, mask: Image | Continuation | None) -> Image:
-    """An image with the nearest value within a mask wherever it is outside: what cells at the boundary stand for.
+    """Continue an image beyond a mask with the nearest value inside, as cells at the boundary represent the inside.
 
-    Only the voxels around the mask are kept. Without a mask it is the image itself.
+    Only the voxels around the mask are kept. Without a mask the image is returned unchanged.
     """
     if mask is None:
         return image
@@ -384,7 +384,7 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
 
 
 def check_weights(n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float) -> None:
-    """InputError for weights of images and labels, or a tension of interfaces, that `content` does not take."""
+    """Raise InputError for invalid weights of images and labels, or an invalid tension of interfaces."""
     low, high = WEIGHT_RANGE
     if len(weights) != n_images or not all(w == 0.0 or low <= w <= high for w in weights):
         raise InputError(
@@ -412,24 +412,22 @@ def _check(
     for name, image in named:
         if image.shape != first.shape:
             raise InputError(
-                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.resample_mask and the like"
+                f"{name}: expected shape {first.shape} like the first, got {image.shape}; see tetopt.resample_mask"
             )
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
-            raise InputError(
-                f"{name}: expected voxels in the same place as the first image's; see tetopt.resample_mask"
-            )
+            raise InputError(f"{name}: expected the same voxel grid as the first image's; see tetopt.resample_mask")
     check_weights(len(images), weights, label_weight, smooth_interfaces)
     if others["labels"] is not None:
         check_labels("labels", others["labels"])
 
 
 def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
+    """Channels that distinguish K labels: each voxel's row, and the rows' values in C channels, (C, K).
 
-    Each label has its value in one channel and 0 in the others. Labels that come nowhere near one another share a
-    channel. By voxel a label counts by its fraction of the voxels to the power -`RARITY_POWER`, so that small ones are
-    not given up for the surfaces of large ones; the variance of all is 1.
+    Each label has its value in one channel and 0 in the others. Labels that are nowhere near one another share a
+    channel. The weight of a label's voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small
+    labels are not sacrificed for the surfaces of large ones; the total variance is 1.
     """
     counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
     present = np.flatnonzero(counts)

@@ -1,8 +1,8 @@
-"""The part of an image's box that a mesh is to cover: a mask's region, its surface smooth between the voxels.
+"""The part of an image's box that a mesh covers: a mask's region, with a surface that is smooth between voxels.
 
-The surface is the zero level of a function given at the voxel centres: the signed distance to the mask's surface in
-voxels, negative inside, smoothed so that stairs of voxels become planes and curves, but never further from the mask's
-own surface than a part of a voxel. Between voxel centres the function is linear along each axis.
+The surface is the zero level of a function at the voxel centres: the signed distance to the mask's surface in voxels,
+negative inside. Smoothing turns stairs of voxels into planes and curves, and moves the surface by less than a fraction
+of a voxel. Between voxel centres the function is linear along each axis.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from tetopt.image import Image
 
 INSIDE_FRACTION = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
-SMOOTHING_VOXELS = 1.0  # sigma of the Gaussian that takes the stairs of voxels off the surface
-MOST_SMOOTHED_VOXELS = 0.35  # the furthest that smoothing moves the surface
-ON_SURFACE_VOXELS = 1e-3  # a place with a level as near to 0 lies on the surface
+SMOOTHING_VOXELS = 1.0  # sigma of the Gaussian that smooths the stairs of voxels
+MOST_SMOOTHED_VOXELS = 0.35  # the farthest that smoothing moves the surface
+ON_SURFACE_VOXELS = 1e-3  # a place whose level is this near to 0 lies on the surface
 
 
 class Region(NamedTuple):
@@ -29,10 +29,10 @@ class Region(NamedTuple):
 
 
 def region_of(mask: Image) -> Region:
-    """The region where a mask of values 0 to 1 is a half or more.
+    """The region where a mask of values 0 to 1 is 0.5 or more.
 
-    A mask of two values is smoothed, except where it, or the gap beside it, is one or two voxels thick; one of
-    fractions has its own surface between the voxels, and keeps it.
+    A mask of two values is smoothed, except where it, or a gap in it, is one or two voxels thick. A mask of fractions
+    defines its surface between the voxels and keeps it.
     """
     data = mask.data.astype(np.float64)
     inside = data >= INSIDE_FRACTION
@@ -46,7 +46,7 @@ def region_of(mask: Image) -> Region:
         once = scipy.ndimage.gaussian_filter(raw, SMOOTHING_VOXELS, mode="nearest")
         twice = once + scipy.ndimage.gaussian_filter(
             raw - once, SMOOTHING_VOXELS, mode="nearest"
-        )  # what the first one took of curves, back
+        )  # restores the curvature that the first one removed
         room = np.minimum(scipy.ndimage.maximum_filter(within, size=5), scipy.ndimage.maximum_filter(without, size=5))
         most = MOST_SMOOTHED_VOXELS * np.clip(room - 1.0, 0.0, 1.0)
         level = np.clip(twice, raw - most, raw + most)

@@ -1,4 +1,4 @@
-"""What labels are: whole numbers, of a colour each; and which of them can be kept in one channel."""
+"""Labels: whole numbers with a colour each, and their distribution among channels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.image import Image
 
-LARGEST_LABEL = 32_767  # the largest of 16 bits with a sign, in which many programs keep labels
-APART_VOXELS = 4  # labels that come no nearer to one another may share a channel
+LARGEST_LABEL = 32_767  # largest signed 16-bit integer, the type of labels in many programs
+APART_VOXELS = 4  # labels at least this far from one another may share a channel
 
 # Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
 # black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
@@ -24,13 +24,13 @@ LABEL_PALETTE = (
     "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
-LABEL_TINTS = (0.0, -0.4, 0.4)  # of the palette when it begins again: as it is, mixed with black, mixed with white
-BACKGROUND_LABEL = 0  # the label of what is no tissue
+LABEL_TINTS = (0.0, -0.4, 0.4)  # variants of the palette as it repeats: unchanged, mixed with black, mixed with white
+BACKGROUND_LABEL = 0  # the label outside all tissues
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 
 def check_labels(name: str, labels: Image) -> None:
-    """InputError unless the voxels are whole numbers from 0 to `LARGEST_LABEL`."""
+    """Raise InputError unless the voxels are whole numbers from 0 to `LARGEST_LABEL`."""
     data = labels.data
     wrong = np.argwhere((data < 0) | (data > LARGEST_LABEL) | (np.rint(data) != data))
     if len(wrong):
@@ -58,7 +58,7 @@ def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64
 
 
 def hex_colour(text: Any) -> tuple[float, float, float] | None:
-    """Red, green and blue, 0 to 1, of "#rrggbb"; None of anything else."""
+    """Red, green and blue, 0 to 1, of "#rrggbb"; None for any other text."""
     if not isinstance(text, str) or len(text) != 7 or text[0] != "#":
         return None
     try:
@@ -69,10 +69,10 @@ def hex_colour(text: Any) -> tuple[float, float, float] | None:
 
 
 def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The colours (K, 3) of labels from 0 that have none of their own: red, green and blue, 0 to 1; 0 in light grey.
+    """Default colours (K, 3) of labels from 0: red, green and blue, 0 to 1; label 0 is light grey.
 
-    They depend on the number alone, so that a label has one colour in every picture and file. Of three times the
-    palette's length in a row any two differ.
+    They depend only on the number, so that a label has the same colour in every picture and file. Any two of as many
+    successive labels as three palettes have different colours.
     """
     palette = np.array([hex_colour(text) for text in LABEL_PALETTE])
     rounds, place = np.divmod(labels - 1, len(palette))

@@ -1,8 +1,8 @@
-"""What labels mean between voxels: of each label a smooth level, whose smallest says which label a place has.
+"""Labels between voxels: a smooth level for each label; each place has the label with the smallest level.
 
 A label's level is the signed distance to its surface, in voxels, negative inside, so that the interface between
-labels a and b is where their levels are equal. Since each place has the label of the smallest level, labels leave no
-gaps and do not overlap, where three of them meet as well. Between voxel centres a level is linear along each axis.
+labels a and b is where their levels are equal. Since each place has the label of the smallest level, labels neither
+overlap nor leave gaps, even where three of them meet. Between voxel centres a level is linear along each axis.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
-PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
-NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then
-FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
-FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
-FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
-THIN_REACH = 4.0, 7.0  # voxels from the middle to the surface of what is thin for the broad one, and of what is not
+PARTITION_BYTES = 40.0  # per voxel, in addition to levels: its label, the nearest label, and temporaries
+NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
+FARTHEST_LEVEL = 6.0  # levels are clipped there: nodes that move in steps near an interface need no larger ones
+FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label are irrelevant, more than levels and smoothing use
+FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels, sigma of the Gaussian where a label or gap is thin, and elsewhere
+THIN_REACH = 4.0, 7.0  # voxels from middle to surface of labels too thin for the broad Gaussian, and of thick ones
 VOLUME_SIGMA, VOLUME_BLOCK = (
     3.0,
     2,
-)  # volumes are kept in a Gaussian of so many voxels, at least; summed over blocks
-NEAR_SURFACE = 0.05, 0.95  # distance from the surface of a voxel beside it: less than 1, and its centre keeps its label
-MOST_LIFTED = 1.0  # voxels by which smoothing changes levels further off: what distances to voxels can be wrong by
-LEAST_SLOPE = 0.3  # of a level that volumes are measured with; flatter ones are those of sheets of a voxel
-FLOW_STEPS = 4  # more do not bring spheres of 3 to 20 voxels, or shells of 2 to 6, any nearer to the true ones
-ABSENT_DISTANCE = 1e4  # voxels to what is not in a slice at all
+)  # least sigma, voxels, of the Gaussian within which volumes are preserved; summed over blocks
+NEAR_SURFACE = 0.05, 0.95  # distance range of voxels beside the surface: below 1, and centres keep their label
+MOST_LIFTED = 1.0  # voxels by which smoothing may change levels farther off: the error of distances to voxels
+LEAST_SLOPE = 0.3  # least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
+FLOW_STEPS = 4  # more steps do not improve spheres of 3 to 20 voxels or shells of 2 to 6
+ABSENT_DISTANCE = 1e4  # voxels to a label that is absent from a slice
 
 
 class Memberships(NamedTuple):
-    """Of each label a level on a grid of voxel centres; made by `memberships`."""
+    """Levels of labels on a grid of voxel centres; made by `memberships`."""
 
-    labels: NDArray[np.int64]  # (K,) values, rising, of those present
-    channel: NDArray[np.int64]  # (K,) row of `levels` of each; labels nowhere near one another share one
+    labels: NDArray[np.int64]  # (K,) labels present, ascending
+    channel: NDArray[np.int64]  # (K,) row of `levels` for each label; labels nowhere near one another share one
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
-    partition: NDArray[np.int64]  # (*shape) row of `labels` of each voxel, that of the smallest level
-    parts: int = 1  # voxels of this grid to one of the labels'
+    partition: NDArray[np.int64]  # (*shape) row of `labels` with the smallest level at each voxel
+    parts: int = 1  # voxels of this grid per voxel of the labels
 
 
 def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
-    """Into how many a voxel of these edges (n,), mm, is divided along each axis, so that its parts are nearly cubes.
+    """Number of parts along each axis that divide a voxel with edges (n,), mm, nearly into cubes.
 
     Odd numbers, so that a slice's plane goes through voxels' centres: 1, 3, 5, ..., whichever is nearest in ratio.
     """
@@ -60,7 +60,7 @@ def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
 
 
 def finer(image: Image, factors: Sequence[int]) -> Image:
-    """The image on voxels divided into so many along each axis; its box stays the same.
+    """The image on voxels divided by `factors` along the axes; its box stays the same.
 
     Between the centres of two voxels intensities are linear; beyond the outermost they are constant.
     """
@@ -69,12 +69,12 @@ def finer(image: Image, factors: Sequence[int]) -> Image:
 
 
 def finer_index(n: int, factor: int) -> NDArray[np.float64]:
-    """Where the centres of `n` voxels divided into `factor` each lie, (n * factor,), in the index of the whole ones."""
+    """Centres of `n` voxels divided into `factor` each, in index coordinates of the whole voxels, (n * factor,)."""
     return (np.arange(n * factor) + 0.5) / factor - 0.5
 
 
 def finer_affine(affine: NDArray[np.float64], factors: Sequence[int]) -> NDArray[np.float64]:
-    """The affine (n+1, n+1) of voxels divided into so many along each axis."""
+    """The affine (n+1, n+1) of voxels divided by `factors` along the axes."""
     step = np.append(1.0 / np.asarray(factors, dtype=np.float64), 1.0)
     moved = affine * step
     moved[:-1, -1] += affine[:-1, :-1] @ (0.5 * step[:-1] - 0.5)
@@ -82,18 +82,18 @@ def finer_affine(affine: NDArray[np.float64], factors: Sequence[int]) -> NDArray
 
 
 def memberships(labels: Image, factors: Sequence[int] | None = None) -> Memberships:
-    """Of each label the signed distance to its smooth surface, on the labels' voxels or on finer ones.
+    """Signed distance to the smooth surface of each label, on the labels' voxels or finer ones.
 
-    Every voxel's centre keeps its label: on a slice's plane the surface stays between the same two voxels' centres.
-    Between slices that are divided it is interpolated by shape (Raya and Udupa 1990, IEEE Trans. Med. Imaging 9, 32),
-    and smoothing may move it by one more finer voxel for each that the plane is away.
+    Every voxel's centre keeps its label: on a slice's plane the surface stays between the same two voxel centres.
+    Between divided slices it is interpolated by shape (Raya and Udupa 1990, IEEE Trans. Med. Imaging 9, 32), and
+    smoothing may move it by one more fine voxel for each fine voxel of distance from the plane.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0.
     factors : sequence of int, optional
-        Into how many a voxel is divided along each axis, odd, as `supersampling` has them; 1 by default.
+        Number of parts of a voxel along each axis, odd, as from `supersampling`; 1 by default.
 
     Raises
     ------
@@ -106,9 +106,9 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
     raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
     n_voxels = labels.data.size * prod(factors)
-    what = f"labels: {len(values)} of them on {n_voxels} voxels"
+    what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:
-        what += f", which are divided by {' x '.join(map(str, factors))}"
+        what += f" (after division by {' x '.join(map(str, factors))})"
     check_memory(PARTITION_BYTES * n_voxels, what, NO_ROOM)
     off = np.zeros(labels.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
@@ -132,21 +132,21 @@ def gathered(
     level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
     parts: int,
 ) -> Memberships:
-    """The levels of labels in as few channels as can be, and of each voxel the label whose is the smallest.
+    """Collect the levels of labels in as few channels as possible, with the label of the smallest at each voxel.
 
     Parameters
     ----------
     values : (K,) int
-        Labels, rising.
+        Labels, ascending.
     start : (*shape) int
-        Row of `values` of each voxel, to begin with.
+        Initial row of `values` of each voxel.
     level_in : callable
-        The level of a row within a box of the voxels; that is called on several threads.
+        Function that returns the level of a row within a box of the voxels; called on several threads.
     parts : int
-        Voxels to one of the labels'.
+        Voxels per voxel of the labels.
     """
     channel = label_channels(start, len(values))
-    what = f"labels: {len(values)} of them on {start.size} voxels"
+    what = f"labels: {len(values)} labels on {start.size} voxels"
     check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * start.size, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
@@ -163,7 +163,7 @@ def gathered(
 def labels_at(
     members: Memberships, index: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Rows of the labels whose levels are smallest at barycentric places (S, K) in cells (M, K) of nodes; (M, S).
+    """Rows of the labels with the smallest level at barycentric places (S, K) in cells (M, K), (M, S).
 
     Nodes lie at index positions (N, n).
     """
@@ -198,7 +198,7 @@ def _fill_labels(
 
 @njit(cache=True, nogil=True)
 def _label_between(partition: NDArray, levels: NDArray, channel: NDArray, corner: NDArray, fraction: NDArray) -> int:
-    """The label of the smallest level among those of the voxels (8, 3) around a place, fractions from the first on."""
+    """The label of smallest level among the voxels (8, 3) around a place, given as fractions from the first."""
     best, least, is_same = partition[corner[0, 0], corner[0, 1], corner[0, 2]], np.inf, True
     for m in range(1, 8):
         is_same = is_same and partition[corner[m, 0], corner[m, 1], corner[m, 2]] == best
@@ -215,7 +215,7 @@ def _label_between(partition: NDArray, levels: NDArray, channel: NDArray, corner
 
 
 def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """A label's box with a margin, beyond which its level is the farthest."""
+    """A label's box with a margin, beyond which its level is `FARTHEST_LEVEL`."""
     ends = ((max(s.start - FARTHEST_DISTANCE, 0), s.stop + FARTHEST_DISTANCE) for s in box)
     return tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, shape, strict=True))
 
@@ -225,20 +225,20 @@ def _level(
 ) -> NDArray[np.float32]:
     """The smooth level of a label, (*shape) float32.
 
-    Stairs are taken off as by biharmonic flow: 2 G - G^2, of a Gaussian G, keeps planes and quadrics. After each step
-    volumes are put right and voxels beside the surface brought back to their own side, so that what was smoothed too
-    far returns. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
+    Smoothing removes stairs like biharmonic flow: 2 G - G^2, with a Gaussian G, preserves planes and quadrics. Each
+    step then corrects volumes and returns voxels beside the surface to their own side, which undoes excessive
+    smoothing. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
 
     Parameters
     ----------
     inside : (*shape) bool
         Voxels of the label; between slices by shape.
     raw : (*shape) bool
-        The same, with the label of the slice that each voxel is of: its volume is kept.
+        The same with the label of each voxel's slice, whose volume is preserved.
     off : (*shape) float32
-        How many voxels each is away from the plane of a slice; 0 between slices that have the same label.
+        Distance of each voxel from the plane of a slice, voxels; 0 between slices with the same label.
     factors : sequence of int
-        How many voxels a slice is thick along each axis.
+        Thickness of a slice along each axis, voxels.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
@@ -257,10 +257,10 @@ def _level(
 
 
 def near_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """To the nearest voxel's centre outside, voxels; 0 outside, and what is far is cut off.
+    """Distance to the nearest voxel centre outside, voxels; 0 outside, clipped where it is far.
 
-    Its square is the least over the three axes, one after the other, of squares of steps (Felzenszwalb and Huttenlocher
-    2012); as only short ones count, all of them are tried, in bytes: a tenth of the time of scipy's transform.
+    Its square is the least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short
+    steps matter, all are tried, in bytes: a tenth of the time of scipy's transform.
     """
     assert FARTHEST_DISTANCE**2 + (FARTHEST_DISTANCE - 1) ** 2 < 256
     square = np.where(inside, np.uint8(FARTHEST_DISTANCE**2), np.uint8(0))
@@ -291,9 +291,9 @@ def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 
 def _correlated(data: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """`data` weighed along each axis, symmetrically, `weights` (R+1,) from the middle on; constant beyond its faces.
+    """Correlate `data` along each axis with symmetric `weights` (R+1,), from the middle; constant beyond its faces.
 
-    As by `scipy.ndimage`, to the last bit; but the last axis row by row, in a third of its time.
+    Equal to `scipy.ndimage` to the last bit, but the last axis is done row by row, in a third of the time.
     """
     for axis in range(data.ndim - 1):
         rows = np.ascontiguousarray(data).reshape(prod(data.shape[:axis]), data.shape[axis], -1)
@@ -303,7 +303,7 @@ def _correlated(data: NDArray[np.float32], weights: NDArray[np.float64]) -> NDAr
 
 @njit(cache=True, nogil=True)
 def _correlated_rows(data: NDArray, weights: NDArray) -> NDArray:
-    """The middle axis of `data` (A, n, B) weighed; sums in float64 and in scipy's order, for all B at once."""
+    """Correlate the middle axis of `data` (A, n, B), with sums in float64 and in scipy's order, for all B at once."""
     result, total = np.empty_like(data), np.empty(data.shape[2])
     for a in range(data.shape[0]):
         for i in range(data.shape[1]):
@@ -322,12 +322,12 @@ def _correlated_rows(data: NDArray, weights: NDArray) -> NDArray:
 def with_volume(
     level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, bounds: tuple[NDArray, NDArray] | None = None
 ) -> NDArray[np.float32]:
-    """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`.
+    """Raise or lower the level smoothly, so that it has the label's volume within `sigma`.
 
-    Within lower and upper `bounds`, if they are given. Both passes over the voxels are kernels: numpy took three times
-    as long.
+    It stays within lower and upper `bounds`, if given. Both passes over the voxels are kernels, which take a third of
+    numpy's time.
     """
-    mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, of the level that is linear between centres
+    mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, with the level linear between centres
     whole = (1,) * (3 - level.ndim) + level.shape
     blocks = [-(-n // VOLUME_BLOCK) for n in whole]
     missing, area = np.empty(blocks, dtype=np.float32), np.empty(blocks, dtype=np.float32)
@@ -341,15 +341,15 @@ def with_volume(
 
 
 def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Sums over blocks, weighed by a Gaussian of `sigma` voxels over the blocks around."""
+    """Sums over blocks, smoothed by a Gaussian of `sigma` voxels."""
     return scipy.ndimage.gaussian_filter(sums, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_block_sums(missing: NDArray, area: NDArray, level: NDArray, mean: NDArray, raw: NDArray) -> None:
-    """Sum over blocks the volume that a level lacks of its label, and the voxels that its surface goes through.
+    """Sum over blocks the volume that a level lacks compared with its label, and the voxels that its surface crosses.
 
-    What of a voxel is inside follows from the mean of the level over it and from the level's slope.
+    The fraction of a voxel inside follows from the level's mean over it and its slope.
     """
     lacking, is_near = np.zeros((2, 2, 2), dtype=np.float32), np.zeros((2, 2, 2), dtype=np.float32)
     half, one = np.float32(0.5), np.float32(1.0)
@@ -379,7 +379,7 @@ def _block_sum(values: NDArray) -> np.float32:
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
-    """Of the gradient, with the larger difference along each axis; across a thin sheet those of both sides cancel."""
+    """Length of the gradient, from the larger one-sided differences, as both sides cancel across a thin sheet."""
     here, square = level[x, y, z], np.float32(0.0)
     last = level.shape[0] - 1, level.shape[1] - 1, level.shape[2] - 1
     for axis in range(3):
@@ -393,7 +393,7 @@ def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_lowered(result: NDArray, level: NDArray, lowered: NDArray, low: NDArray, high: NDArray) -> None:
-    """Lower a level by what is given for blocks, linear between their middles, and keep it within bounds."""
+    """Lower a level by values for blocks, linear between their centres, and keep it within bounds."""
     first, part = np.zeros((3, max(level.shape)), dtype=np.int64), np.zeros((3, max(level.shape)), dtype=np.float32)
     for axis in range(3):
         n = lowered.shape[axis]
@@ -419,7 +419,7 @@ def _fill_lowered(result: NDArray, level: NDArray, lowered: NDArray, low: NDArra
 
 
 def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
-    """Values at the centres of voxels divided into so many along each axis: linear, constant beyond the outermost."""
+    """Values at the centres of voxels divided by `factors` along the axes: linear, constant beyond the outermost."""
     for axis, factor in enumerate(factors):
         if factor > 1:
             n = data.shape[axis]
@@ -433,7 +433,7 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
 
 
 def _off_planes(number: NDArray[np.int64], axis: int, factor: int) -> NDArray[np.float32]:
-    """How many voxels each is away from its slice's plane, after the division, where slices differ; 0 elsewhere."""
+    """Distance of each divided voxel from its slice's plane, voxels, where slices differ; 0 elsewhere."""
     n = number.shape[axis]
     along = np.arange(n * factor)
     away = along % factor - factor // 2
@@ -445,9 +445,9 @@ def _off_planes(number: NDArray[np.int64], axis: int, factor: int) -> NDArray[np
 def _merge_crumbs(
     levels: NDArray[np.float32], partition: NDArray[np.int64], channel: NDArray[np.int64], is_plane: NDArray[np.bool_]
 ) -> None:
-    """Pieces of a label between slices that reach no slice's plane join what is nearest, in place.
+    """Merge components of a label between slices that reach no slice's plane into the nearest label, in place.
 
-    There the two labels' levels are exchanged.
+    The two labels' levels are exchanged there.
     """
     is_crumb = np.zeros(partition.shape, dtype=bool)
     for row, box in enumerate(scipy.ndimage.find_objects(partition + 1)):
@@ -468,17 +468,17 @@ def _merge_crumbs(
 def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
     """Labels on slices divided along one axis, interpolated by shape.
 
-    Within a slice a label's level is the signed distance to its outline, and between slices it is linear. A piece that
-    the next slice has nothing of shrinks to its innermost point on half the way.
+    Within a slice a label's level is the signed distance to its outline; between slices it is linear. A component that
+    is absent from the next slice shrinks to its innermost point halfway.
 
     Parameters
     ----------
     number : (*shape) int
         Rows of labels.
     axis : int
-        The one that is divided.
+        The divided axis.
     factors : sequence of int
-        Of all axes; those behind `axis` are not divided yet, and their voxels are as many times longer.
+        Factors of all axes; axes after `axis` are not divided yet, so that their voxels are longer by their factors.
     """
     length = [float(f) if i > axis else 1.0 for i, f in enumerate(factors)]
     length[axis] = ABSENT_DISTANCE
@@ -514,17 +514,17 @@ def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Seq
 
 
 def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> NDArray[np.float32]:
-    """How far from its outline a slice is at most where slice `k` is on the other side.
+    """Largest distance of a slice from its outline where slice `k` is on the other side.
 
-    A piece that ends there, of depth D, is cut off at its depth d after the fraction t = sqrt(1 - (1 - d / D)^2) / 2 of
-    the way: as half an ellipsoid that ends half way. Linear between -d and the other level, that is d (1 / t - 1).
+    A component of depth D that ends there is cut off at its depth d after the fraction t = sqrt(1 - (1 - d / D)^2) / 2
+    of the way, like half an ellipsoid that ends halfway. Linear from -d, the other level is d (1 / t - 1).
     """
     fraction = np.abs(level[k]) / deepest[k]
     return deepest[k] * (2.0 * np.sqrt(fraction / (2.0 - fraction)) - fraction)
 
 
 def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Within each slice the signed distance to the outline, and the largest in the piece that a voxel is of."""
+    """Signed distance to the outline within each slice, and the largest in each voxel's component."""
     link = np.zeros((3,) * inside.ndim)
     link[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]] if inside.ndim == 3 else [1, 1, 1]
     level, deepest = np.zeros(inside.shape, dtype=np.float32), np.zeros(inside.shape, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""How strong an image's noise is, from a sample of its planes."""
+"""Strength of an image's noise, from a sample of its planes."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-SAMPLED_VOXELS = 100_000  # of these the most frequent value is taken for the background's
-NOISE_VOXELS = 1_000_000  # of these, or more, the noise is estimated; all of a smaller image's
-MOST_LABEL_VALUES = 32  # an image of no more values than this is one of labels, and has no noise
+SAMPLED_VOXELS = 100_000  # sample whose most frequent value counts as the background's
+NOISE_VOXELS = 1_000_000  # least number of voxels for estimating the noise; a smaller image uses all
+MOST_LABEL_VALUES = 32  # an image with no more distinct values holds labels, and has no noise
 
 
 class NoiseSample(NamedTuple):
-    """Of an image's voxels, what its noise is estimated from; made by `noise_sample`."""
+    """Voxels of an image from which its noise is estimated; made by `noise_sample`."""
 
-    values: NDArray  # (K,) every so many voxels one
-    near: NDArray  # (3, P, ...) planes before others, these P themselves, and those after
+    values: NDArray  # (K,) values at a regular spacing
+    near: NDArray  # (3, P, ...) the planes before P planes, these planes, and those after
 
 
 def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:
-    """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
+    """Standard deviation of the noise in an image's data, estimated from second differences along every axis.
 
-    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
-    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
-    what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
-    is underestimated. With `inside` only the voxels there, and not beside others, are looked at. Of a large image these
-    are about `NOISE_VOXELS`, in slices an odd number apart along the first axis: four real volumes came out within
-    0.7 % of what all of their voxels say, to the last bit where intensities are whole numbers.
+    Structure wider than a voxel cancels in (1, -2, 1) along all axes (Immerkaer 1996, here in n-D), and the lower
+    quartile of the magnitude is that of noise in most of the volume. A constant background is ignored; differences in
+    less than a tenth of the voxels are edges, not noise, and labels have none. Smoothed noise is underestimated. With
+    `inside` only voxels there, with all neighbours inside, are used. A large image is sampled at about `NOISE_VOXELS`,
+    in slices an odd number apart along the first axis: for four real volumes this was within 0.7 % of the estimate from
+    all voxels, and equal to the last bit for whole numbers.
     """
     return sampled_noise(noise_sample(data), None if inside is None else noise_sample(inside).near)
 
 
 def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
-    """How many voxels apart values are sampled, and the numbers of the planes that second differences are taken at.
+    """Sampling distance of values, voxels, and indices of the planes at which second differences are taken.
 
-    None of an image of less than three voxels along an axis.
+    An image with fewer than three voxels along an axis has no such planes.
     """
     size = prod(shape)
     step = max((size // NOISE_VOXELS - 1) // 2 * 2 + 1, 1)
@@ -52,10 +52,10 @@ def noise_sample(data: NDArray) -> NoiseSample:
 
 
 def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) -> float:
-    """The same as `noise_level` from a sample; `inside` is of its planes, (3, P, ...)."""
+    """`noise_level` from a sample; `inside` covers its planes, (3, P, ...)."""
     if sample.near.size == 0:
         return 0.0
-    # An image of few values is one of labels, which have no noise.
+    # An image with few distinct values holds labels, which have no noise.
     values, often = np.unique(sample.values, return_counts=True)
     if len(values) <= MOST_LABEL_VALUES:
         return 0.0

@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
-HISTOGRAM_BINS = 256  # of the histogram whose classes are found: as many as 8-bit images have values
-TAIL_FRACTION = 0.0005  # of the weight at either end, which may be some voxels far brighter than all others
-FEWEST_BINS = 64  # that all but the tails should spread over: with fewer, thresholds between classes are too coarse
+HISTOGRAM_BINS = 256  # bins of the histogram, as many as the values of 8-bit images
+TAIL_FRACTION = 0.0005  # of the weight at either end, which may be a few voxels far brighter than all others
+FEWEST_BINS = 64  # least number of bins for all but the tails: with fewer, thresholds are too coarse
 
 
 def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> NDArray[np.float64]:
-    """Thresholds between the classes that leave the least variance within them (Otsu 1979, for any number).
+    """Thresholds between classes that minimise the variance within them (Otsu 1979, for any number).
 
-    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958). The bins are
-    from the least value to the greatest, unless all but a thousandth of the weight lies in fewer than 64 of them, as
-    where one voxel is far brighter than the rest: then they are of these alone, and what lies beyond is in the last.
+    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958). The bins
+    span the least to the greatest value. If all but a thousandth of the weight lies in fewer than 64 of them, as where
+    one voxel is far brighter than the rest, they span these alone, and the end bins take the remaining values.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     Raises
     ------
     InputError
-        Fewer than 2 classes, or fewer different bins than classes; values that bins cannot part.
+        Fewer than 2 classes, fewer filled bins than classes, or values that bins cannot separate.
     """
     if classes < 2:
         raise InputError(f"classes: expected 2 or more, got {classes}")
@@ -44,13 +44,13 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     is_filled = counts > 0
     if is_filled.sum() < classes:
         raise InputError(
-            f"classes: {classes} asked for, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
+            f"classes: {classes} requested, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
         )
     centres = 0.5 * (edges[1:] + edges[:-1])[is_filled]
     counts = counts[is_filled].astype(np.float64)
     within = _within_class_sums(counts, centres - centres.mean())
     n = len(counts)
-    cost = within[0, 1:]  # of one class over bins 0 .. b
+    cost = within[0, 1:]  # cost of one class over bins 0 .. b
     last_cut = []
     for _ in range(classes - 1):
         candidates = np.full((n, n), np.inf)  # [first bin of the last class, its last bin]
@@ -69,11 +69,11 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
 def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArray[np.float64]]:
     """Counts and edges of the bins, see `class_thresholds`."""
     low, high = values.min(), values.max()
-    steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # as numpy's bins are
+    steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # like numpy's bins
     if low < high and not (steps[:-1] < steps[1:]).all():
         raise InputError(
-            f"classes: expected intensities that {HISTOGRAM_BINS} bins can part, got {low} to {high}; subtract what "
-            "all of them have"
+            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} to {high}; subtract the "
+            "offset common to all"
         )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
     fraction = np.cumsum(counts) / counts.sum()
@@ -87,7 +87,7 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     if not low < high:
         return counts, edges
     narrow = np.histogram(np.clip(values, low, high), bins=HISTOGRAM_BINS, weights=weights)
-    # Of few values, as of two of which one is rare, there may be no more bins than before.
+    # With few values, such as two of which one is rare, there may be no more bins than before.
     return narrow if (narrow[0] > 0).sum() > (counts > 0).sum() else (counts, edges)
 
 

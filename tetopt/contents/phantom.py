@@ -17,14 +17,14 @@ A phantom is a TOML file, for example ::
     label = 1
 
 Top level
-    ``name``, ``description``, ``size_mm``, ``voxel_mm`` and ``background`` are needed. Optional are
-    ``center_mm`` (world place of the box's centre, the origin unless given), ``axes``, ``blur_mm`` and
-    ``noise_sd`` (standard deviations, 0), ``seed`` (0) and the shapes themselves. ``axes`` has one *row* for
-    each voxel axis, its direction in the world, of any length (it is normalised); rows need not be
+    ``name``, ``description``, ``size_mm``, ``voxel_mm`` and ``background`` are required. Optional are
+    ``center_mm`` (world position of the box's centre, by default the origin), ``axes``, ``blur_mm`` and
+    ``noise_sd`` (standard deviations, default 0), ``seed`` (default 0) and the shapes. ``axes`` has one *row* for
+    each voxel axis: its direction in the world, of any length (it is normalised); rows need not be
     orthogonal. They are the directions of the affine's *columns*, and the domain is the parallelepiped that
     they span with the lengths ``size_mm``.
 Shapes
-    All live in world millimetres, whatever ``axes`` is. Each has a ``kind``, an ``intensity``, a ``label``
+    All shapes are in world millimetres, whatever ``axes`` is. Each has a ``kind``, an ``intensity``, a ``label``
     (an integer, 0 or more) and optionally a ``name``:
 
     - ``ellipsoid``: ``center_mm``, ``radii_mm`` and optionally ``rotation_deg``;
@@ -32,8 +32,8 @@ Shapes
     - ``layer``: the slab ``|normal . x - offset_mm| <= thickness_mm / 2``; ``normal`` has any length (it is
       normalised first).
 
-    ``rotation_deg`` is in 2-D one angle, counter-clockwise; in 3-D three, about the fixed world axes x, then
-    y, then z. A shape contains its own surface, up to rounding.
+    In 2-D ``rotation_deg`` is one counter-clockwise angle; in 3-D it is three angles, about the fixed world axes x,
+    then y, then z. A shape contains its own surface, up to rounding.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ from tetopt.image import SINGULAR_DETERMINANT, Image, transformed
 from tetopt.system.budget import check_memory
 from tetopt.system.incoming import toml_of
 
-PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and what is written of them; 17 were measured
+PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and the data written; 17 were measured
 MAX_PHANTOM_VOXELS = 2**36  # 4096^3: 137 GB of 16 bits, box by box
-MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 to a voxel in 3-D, as many as fit one chunk of points
-BLUR_SIGMAS = 4.0  # standard deviations that a blur reaches: beyond is less than a ten thousandth of it
+MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 per voxel in 3-D, which fit into one chunk of points
+BLUR_SIGMAS = 4.0  # reach of a blur, in standard deviations: less than 1e-4 of it lies beyond
 POINTS_PER_CHUNK = 2**18  # evaluated at once, with a few tens of MB of temporaries
 
 _TOP_KEYS = ("name", "description", "size_mm", "voxel_mm", "background")
@@ -78,7 +78,7 @@ class Shape:
     Parameters
     ----------
     kind : {"ellipsoid", "box", "layer"}
-        What it is.
+        Kind of the shape.
     center : (n,) float64
         World mm.
     frame : (m, n) float64
@@ -86,9 +86,9 @@ class Shape:
     half : (m,) float64
         Radii, or half the edge lengths, along those axes, mm.
     intensity : float
-        Inside.
+        Intensity inside.
     label : int
-        Inside.
+        Label inside.
     name : str
         Empty if the file gives none.
 
@@ -109,10 +109,10 @@ class Shape:
 
 
 def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
-    """A lower bound of the distance from the shape's surface, negative inside, with the exact zero set.
+    """Lower bound of the distance from the shape's surface, negative inside, with the exact zero set.
 
     Its Lipschitz constant is 1, so a ball of radius r about x can meet the surface only if the absolute value
-    at x is at most r. It is the distance itself for a layer and a box. For an ellipsoid with radii D it is
+    at x is at most r. For a layer and a box it is the distance itself. For an ellipsoid with radii D it is
     ``(|D^-1 (x - c)| - 1) min(D)``: the gradient of ``|D^-1 y|`` is no longer than ``1 / min(D)``.
 
     Parameters
@@ -125,7 +125,7 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
     (...) float64, mm
     """
     points = np.asarray(points, dtype=np.float64)
-    # One axis at a time instead of a matrix product: BLAS rounds by the batch's size, and a point lying on a
+    # One axis at a time instead of a matrix product: the rounding of BLAS depends on the batch's size, and a point on a
     # surface must fall on the same side in every batch.
     shifted = [points[..., i] - c for i, c in enumerate(shape.center)]
     local = [sum(r * x for r, x in zip(row, shifted, strict=True) if r != 0.0) for row in shape.frame]
@@ -140,32 +140,32 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """A box with a background and shapes painted over it in order; see the module's text for the file.
+    """A box with a background and shapes painted over it in order; the module's docstring describes the file.
 
-    Made by `load_phantom`, which checks everything. Arrays are read-only.
+    `load_phantom` makes phantoms and checks everything. Arrays are read-only.
 
     Parameters
     ----------
     name, description : str
-        As the file has them.
+        Name and description from the file.
     size_mm : (n,) float64
         Edge lengths of the box along the voxel axes, n = 2 or 3.
     voxel_mm : (n,) float64
-        Voxel edges that `image` renders with unless told otherwise.
+        Default voxel edges of `image`.
     center_mm : (n,) float64
-        World place of the box's centre.
+        World position of the box's centre.
     axes : (n, n) float64
         Unit rows: world direction of each voxel axis.
     background_intensity : float
-        Of what no shape covers.
+        Intensity outside all shapes.
     background_label : int
-        Of what no shape covers.
+        Label outside all shapes.
     shapes : tuple of Shape
-        In the order in which they are painted.
+        Shapes in painting order.
     blur_mm, noise_sd : float
         Standard deviations of the rendered image's blur and noise.
     seed : int
-        Of the noise.
+        Seed of the noise.
 
     Examples
     --------
@@ -193,7 +193,7 @@ class Phantom:
         return len(self.size_mm)
 
     def intensity(self, points: ArrayLike) -> NDArray[np.float64]:
-        """The exact intensity at points, also outside the box.
+        """The exact intensity at points inside and outside the box.
 
         Parameters
         ----------
@@ -218,7 +218,7 @@ class Phantom:
         return self._intensities()[self._top_shape(self._checked_points(points))]
 
     def labels(self, points: ArrayLike) -> NDArray[np.int64]:
-        """The label at points, also outside the box.
+        """The label at points inside and outside the box.
 
         Parameters
         ----------
@@ -250,12 +250,12 @@ class Phantom:
         seed: int | None = None,
         supersample: int = 4,
     ) -> Image:
-        """The phantom as voxels; the file has the options that are left out.
+        """Render the phantom as voxels; options default to the file's.
 
         A voxel that a surface may cut (its centre is no farther from it than half the voxel's longest
-        diagonal, by the bound of `signed_distance`) holds the mean over ``supersample**n`` midpoints of its
-        sub-voxels; any other lies in one shape and holds that value exactly. Then comes the blur, then the
-        noise. A layer thinner than a sub-voxel is seen only where it meets a midpoint: raise `supersample`.
+        diagonal, by the bound of `signed_distance`) holds the mean over the ``supersample**n`` midpoints of its
+        sub-voxels; any other voxel lies in one shape and holds its value exactly. Then the blur and the noise are
+        applied. A layer thinner than a sub-voxel shows only where it meets a midpoint: raise `supersample`.
 
         Parameters
         ----------
@@ -268,19 +268,19 @@ class Phantom:
         noise_sd : float, optional
             Standard deviation of white Gaussian noise, in units of intensity. It may make values negative.
         seed : int, optional
-            Of the noise; the same seed gives the same bits.
+            Seed of the noise; the same seed gives the same bits.
         supersample : int
             Sub-voxels along each axis, 1 to 64; 1 gives the intensity at the voxel centres.
 
         Returns
         -------
         Image
-            Of float64, in the phantom's box.
+            float64, in the phantom's box.
 
         Raises
         ------
         InputError
-            An option out of range, more than ``2**36`` voxels, or than fit into memory.
+            An option out of range, more than ``2**36`` voxels, or more than fit into memory.
 
         Examples
         --------
@@ -303,30 +303,30 @@ class Phantom:
         seed: int | None = None,
         supersample: int = 4,
     ) -> PhantomVoxels:
-        """The voxels of `image`, painted box by box when they are asked for: together they need not fit into memory.
+        """The voxels of `image`, rendered box by box on demand, so that they need not fit into memory.
 
         Parameters
         ----------
         voxel_mm : float or (n,) floats, optional
-            As of `image`, and so the others.
+            Voxel edges, as for `image`, like the other options.
         blur_mm : float, optional
-            mm.
+            Blur, mm.
         noise_sd : float, optional
-            Unit of intensity.
+            Noise, in units of intensity.
         seed : int, optional
-            Of the noise.
+            Seed of the noise.
         supersample : int
             Sub-voxels along each axis.
 
         Returns
         -------
         PhantomVoxels
-            An array of which slices are painted when they are asked for.
+            An array whose boxes are rendered on demand.
 
         Raises
         ------
         InputError
-            As `image`, but for the number of voxels.
+            As for `image`, except for the number of voxels.
 
         Examples
         --------
@@ -336,7 +336,7 @@ class Phantom:
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
-        if blur > self.size_mm.max():  # beyond it nothing is left but the mean, and the filter is as long as it is wide
+        if blur > self.size_mm.max():  # a wider blur leaves only the mean, and its filter would be as long
             raise InputError(f"{where}: blur_mm: expected at most the box's {self.size_mm.max():g} mm, got {blur:g}")
         sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
@@ -349,7 +349,7 @@ class Phantom:
         Parameters
         ----------
         voxel_mm : float or (n,) floats, optional
-            As of `image`.
+            Voxel edges, as for `image`.
 
         Returns
         -------
@@ -359,7 +359,7 @@ class Phantom:
         Raises
         ------
         InputError
-            As `image`.
+            As for `image`.
 
         Examples
         --------
@@ -383,7 +383,7 @@ class Phantom:
         return np.array([self.background_label, *(s.label for s in self.shapes)], dtype=np.int64)
 
     def _checked_points(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Points as float64; InputError unless they are (..., n) finite numbers."""
+        """Points as float64; raise InputError unless they are (..., n) finite numbers."""
         try:
             checked = np.asarray(points, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -396,7 +396,7 @@ class Phantom:
                 f"give {self.ndim} world coordinates in mm for each"
             )
         if not np.isfinite(checked).all():
-            raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; leave those out")
+            raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; remove those points")
         return checked
 
     def _top_shape(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -417,22 +417,22 @@ class Phantom:
             power = MAX_PHANTOM_VOXELS.bit_length() - 1
             raise InputError(
                 f"{where}: voxel_mm: expected at most 2**{power} voxels, got "
-                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; take larger ones"
+                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; use larger ones"
             )
         linear = self.axes.T * (self.size_mm / counts)
         affine = np.eye(self.ndim + 1)
         affine[:-1, :-1] = linear
         affine[:-1, -1] = self.center_mm - linear @ ((counts - 1) / 2)
         try:
-            Image(np.zeros((1,) * self.ndim), affine)  # whose voxels none may have, before they are painted
+            Image(np.zeros((1,) * self.ndim), affine)  # checks the voxels' size before they are rendered
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         return tuple(int(c) for c in counts), affine
 
     def _check_whole(self, shape: tuple[int, ...]) -> None:
-        """InputError unless so many voxels fit into memory, with what is made of them."""
+        """Raise InputError unless the voxels and their temporaries fit into memory."""
         what = f"phantom {self.name!r}: {' x '.join(map(str, shape))} voxels"
-        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "take larger ones, or write it as .zarr")
+        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels, or write it as .zarr")
 
     def _voxel_means(
         self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
@@ -443,15 +443,15 @@ class Phantom:
         its centre than `reach`.
         """
         lowest, near = self._shapes_near(centers, reach)
-        top = np.full(len(centers), lowest)  # last shape that holds the centre
-        base = np.full(len(centers), lowest)  # last shape that holds the whole voxel
+        top = np.full(len(centers), lowest)  # last shape that contains the centre
+        base = np.full(len(centers), lowest)  # last shape that contains the whole voxel
         is_cut = np.zeros((len(self.shapes), len(centers)), dtype=bool)
         for k, shape in near:
             distance = signed_distance(shape, centers)
             top[distance <= 0.0] = k
             base[distance < -reach] = k
             is_cut[k - 1] = np.abs(distance) <= reach
-        # A surface under a shape that holds the whole voxel is not seen. Asking the sub-voxels only about the
+        # A surface under a shape that contains the whole voxel is hidden. Testing the sub-voxels only against the
         # shapes that cut their voxel, instead of all, renders ellipsoids_brain in 0.7 s instead of 3.3 s.
         is_cut &= np.arange(1, len(self.shapes) + 1)[:, None] > base
         intensities = self._intensities()
@@ -468,17 +468,17 @@ class Phantom:
                 is_inside = signed_distance(shape, centers[voxels[rows], None] + offsets) <= 0.0
                 paint[rows] = np.where(is_inside, k, paint[rows])
             values = intensities[paint]
-            # Relative to the first sub-voxel: a voxel found whole keeps its value to the last bit.
+            # Relative to the first sub-voxel, so that a uniform voxel keeps its value to the last bit.
             means[voxels] = values[:, 0] + (values - values[:, :1]).mean(axis=1)
         return means
 
     def _shapes_near(self, centers: NDArray[np.float64], reach: float) -> tuple[int, list[tuple[int, Shape]]]:
-        """The last shape that holds all voxels with these centres, and those painted over it that meet any.
+        """The last shape that contains all voxels with these centres, and later shapes that meet any of them.
 
-        By one distance from the middle of all: most boxes of a large image are in the midst of one shape.
+        It takes a single distance from the middle of all, as most boxes of a large image lie within one shape.
         """
         middle = (centers[0] + centers[-1]) / 2
-        # The 1e-9 is for what rounding does to distances.
+        # The 1e-9 allows for the rounding of distances.
         radius = (np.linalg.norm(centers - middle, axis=1).max() + reach) * (1.0 + 1e-9)
         lowest: int = 0
         near: list[tuple[int, Shape]] = []
@@ -492,11 +492,11 @@ class Phantom:
 
 
 class PhantomVoxels:
-    """The voxels of a phantom, as an array whose boxes are painted when they are asked for by slices.
+    """The voxels of a phantom as an array whose boxes are rendered on demand, by slices.
 
-    A box has the same values whichever else is asked for, to the last bit. Noise is one stream of numbers in the order
-    of the voxels: boxes are asked for best in the order of the first axis, and take memory for all planes that they
-    lie on.
+    A box has the same values, to the last bit, whatever other boxes are read. Noise is one stream of numbers in the
+    order of the voxels: read boxes in the order of the first axis if possible; they take memory for all planes that
+    they lie on.
 
     Parameters
     ----------
@@ -507,7 +507,7 @@ class PhantomVoxels:
         Index -> world mm.
     blur_mm, noise_sd : float
     seed, supersample : int
-        As `Phantom.image`'s.
+        As for `Phantom.image`.
     """
 
     dtype = np.dtype(np.float64)
@@ -523,7 +523,7 @@ class PhantomVoxels:
         sub_index = _index_block((supersample,) * n)
         self._offsets = ((sub_index + 0.5) / supersample - 0.5) @ linear.T
         corners = _index_block((2,) * n) - 0.5
-        # The 1e-9 keeps a voxel that only just touches a surface, whichever way the distances are rounded.
+        # The 1e-9 includes a voxel that just touches a surface, however distances are rounded.
         self._reach = np.linalg.norm(corners @ linear.T, axis=1).max() * (1.0 + 1e-9)
         self._stream, self._next_plane = np.random.default_rng(seed), 0
         self._planes, self._noise = (0, 0), np.empty(0)
@@ -537,7 +537,7 @@ class PhantomVoxels:
         return values
 
     def _blurred(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
-        """A box without noise; with a blur, around it is painted what this reaches."""
+        """A box without noise; for a blur, the box is rendered with the margin that it reaches."""
         if not self._sigmas.any():
             return self._painted(start, stop)
         reach = [int(BLUR_SIGMAS * sigma + 0.5) for sigma in self._sigmas]
@@ -556,9 +556,9 @@ class PhantomVoxels:
         return values
 
     def _noise_of(self, start: int, stop: int) -> NDArray[np.float64]:
-        """Noise of planes along the first axis; numbers before them in the stream are drawn, and left."""
+        """Noise of planes along the first axis; earlier numbers of the stream are drawn and discarded."""
         if self._planes != (start, stop):
-            self._noise = np.empty(0)  # before the next is made
+            self._noise = np.empty(0)  # frees memory before the next is drawn
             if start < self._next_plane:
                 self._stream, self._next_plane = np.random.default_rng(self.seed), 0
             n_bytes = 8 * (stop - start) * math.prod(self.shape[1:])  # of float64
@@ -583,7 +583,7 @@ def phantom_names() -> list[str]:
 
 
 def load_phantom(name_or_path: str | Path) -> Phantom:
-    """A phantom by its name, or from a file.
+    """Load a phantom by its name, or from a file.
 
     Parameters
     ----------
@@ -593,7 +593,7 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     Returns
     -------
     Phantom
-        A box with shapes, of exactly known intensity.
+        A box with shapes and exactly known intensity.
 
     Raises
     ------
@@ -612,20 +612,20 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     if isinstance(name_or_path, str) and path.suffix != ".toml":
         if name_or_path not in phantom_names():
             raise InputError(
-                f"phantom {name_or_path!r}: no such phantom; give one of {', '.join(phantom_names())}, "
+                f"phantom {name_or_path!r}: no such phantom; use one of {', '.join(phantom_names())}, "
                 "or the path of a .toml file"
             )
         path = phantom_folder() / f"{name_or_path}.toml"
     try:
         table = toml_of(path, "phantom's file")
     except InputError as error:
-        known = f"; or give one of the names {', '.join(phantom_names())}" if not path.exists() else ""
+        known = f"; or use one of the names {', '.join(phantom_names())}" if not path.exists() else ""
         raise InputError(f"phantom {error}{known}") from error
     return _phantom(table, f"phantom {path}")
 
 
 def _phantom(table: dict[str, Any], where: str) -> Phantom:
-    """The phantom of a parsed file; InputError, beginning with `where`, for whatever is wrong in it."""
+    """The phantom of a parsed file; raise InputError, starting with `where`, for invalid entries."""
     _check_keys(table, _TOP_KEYS, _TOP_OPTIONS, where)
     size = table["size_mm"]
     if not isinstance(size, list) or len(size) not in (2, 3):
@@ -636,12 +636,12 @@ def _phantom(table: dict[str, Any], where: str) -> Phantom:
     if not isinstance(background, dict):
         raise InputError(
             f"{where}: background: expected a table, got {background!r}; "
-            "write for example background = { intensity = 20, label = 0 }"
+            "for example: background = { intensity = 20, label = 0 }"
         )
     _check_keys(background, ("intensity",), ("label",), f"{where}: background")
     shapes = table.get("shape", [])
     if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
-        raise InputError(f"{where}: shape: expected tables, got {shapes!r}; begin each shape with [[shape]]")
+        raise InputError(f"{where}: shape: expected tables, got {shapes!r}; start each shape with [[shape]]")
     return Phantom(
         name=_text(table["name"], f"{where}: name"),
         description=_text(table["description"], f"{where}: description"),
@@ -670,7 +670,7 @@ def _shape(table: dict[str, Any], n: int, where: str) -> Shape:
     if kind == "layer":
         normal = _numbers(table["normal"], n, f"{where}: normal")
         if not normal.any():
-            raise InputError(f"{where}: normal: expected a direction, got all zeros; give one non-zero entry")
+            raise InputError(f"{where}: normal: expected a direction, got all zeros; make at least one entry non-zero")
         frame = _unit(normal)[None]
         center = frame[0] * _number(table["offset_mm"], f"{where}: offset_mm")
         thickness = np.array([_number(table["thickness_mm"], f"{where}: thickness_mm")])
@@ -704,25 +704,25 @@ def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):  # a row of zeros becomes NaN, and with it the determinant
         axes = np.array([_unit(_numbers(row, n, f"{what}: row {i}")) for i, row in enumerate(rows, start=1)])
     if not abs(np.linalg.det(axes)) >= SINGULAR_DETERMINANT:
-        raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them independent")
+        raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them linearly independent")
     axes.setflags(write=False)
     return axes
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vector at length 1; an axis-aligned one is hit exactly."""
+    """The vector at length 1, exact for an axis-aligned one."""
     vector = vector / np.abs(vector).max()
     return vector / np.linalg.norm(vector)
 
 
 def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Voxel edges (n,); InputError unless positive and no larger than the box."""
+    """Voxel edges (n,); raise InputError unless they are positive and no larger than the box."""
     what = f"{where}: voxel_mm"
     voxel = _positive(_numbers(voxel_mm, len(size_mm), what, is_one_enough=True), what)
     if (voxel > size_mm).any():
         raise InputError(
             f"{what}: expected voxels no larger than the box of {size_mm.tolist()} mm, got {voxel.tolist()}; "
-            "take smaller voxels"
+            "use smaller voxels"
         )
     return voxel
 
@@ -735,9 +735,10 @@ def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
 def _voxel_centers(
     start: Sequence[int], stop: Sequence[int], affine: NDArray[np.float64]
 ) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float64]]]:
-    """Parts of a box of indices, counted from its start, with the world centres (M, n) of their voxels in C order.
+    """Iterate over parts of a box, as indices from its start, with the world centres (M, n) of voxels in C order.
 
-    Term by term, not by BLAS, whose rounding depends on the number of rows: a voxel is the same in every box.
+    Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows: a voxel must be the same
+    in every box.
     """
     edge = round(POINTS_PER_CHUNK ** (1 / len(start)))
     for corner in itertools.product(*(range(a, b, edge) for a, b in zip(start, stop, strict=True))):
@@ -748,20 +749,20 @@ def _voxel_centers(
 
 
 def _check_keys(table: dict[str, Any], needed: Iterable[str], optional: Iterable[str], where: str) -> None:
-    """InputError if a needed key is missing or a key is neither needed nor optional."""
+    """Raise InputError if a required key is missing, or a key is neither required nor optional."""
     missing = [key for key in needed if key not in table]
     if missing:
-        raise InputError(f"{where}: missing {', '.join(missing)}; every one of {', '.join(needed)} is needed")
+        raise InputError(f"{where}: missing {', '.join(missing)}; {', '.join(needed)} are required")
     unknown = [key for key in table if key not in {*needed, *optional}]
     if unknown:
         raise InputError(
-            f"{where}: unknown {', '.join(map(repr, unknown))}; the keys known here are "
+            f"{where}: unknown {', '.join(map(repr, unknown))}; the keys allowed here are "
             f"{', '.join([*needed, *optional])}"
         )
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a finite int or float; the comparison also turns away NaN and integers beyond float64."""
+    """True for a finite int or float; the comparison also rejects NaN and integers beyond float64."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
@@ -795,19 +796,19 @@ def _numbers(value: Any, n: int, what: str, is_one_enough: bool = False) -> NDAr
 
 
 def _positive(values: NDArray[np.float64], what: str) -> NDArray[np.float64]:
-    """The same values; InputError unless all are above 0."""
+    """Return the values; raise InputError unless all are above 0."""
     if not (values > 0.0).all():
         raise InputError(f"{what}: expected lengths above 0 mm, got {values.tolist()}")
     return values
 
 
 def _text(value: Any, what: str) -> str:
-    """A string that is not empty."""
+    """A non-empty string."""
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{what}: expected a text in quotes, got {value!r}")
+        raise InputError(f"{what}: expected a quoted string, got {value!r}")
     return value
 
 
 def _plain(value: Any) -> Any:
-    """NumPy arrays and scalars as Python's lists and numbers; anything else as it is."""
+    """Convert NumPy arrays and scalars to Python lists and numbers; return other values unchanged."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

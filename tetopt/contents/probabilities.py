@@ -1,7 +1,7 @@
-"""Tissue probabilities instead of labels: of each tissue a level whose surfaces lie within voxels.
+"""Tissue probabilities instead of labels: a level for each tissue, with surfaces within voxels.
 
-A voxel has the tissue that is the most probable. Between neighbouring voxels' centres probabilities are linear, and
-the surface of a tissue is where it is as probable as the most probable of the others.
+A voxel has the most probable tissue. Probabilities are linear between neighbouring voxel centres, and the surface of a
+tissue is where it is as probable as the most probable of the others.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ from tetopt.errors import InputError, warn
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 
-RANGE_TOLERANCE = 1e-3  # by which a probability may be below 0 or above 1: rounding of files
-SUM_TOLERANCE = 0.02  # by which the sum may be above 1 untold: of bytes for six tissues
-BYTE_SCALE, PERCENT = 255.0, 100.0  # whole numbers up to the first, and above the second, are of so many parts
+RANGE_TOLERANCE = 1e-3  # by which a probability may be below 0 or above 1, from rounding in files
+SUM_TOLERANCE = 0.02  # by which the sum may exceed 1 without a warning: rounding to bytes for six tissues
+BYTE_SCALE, PERCENT = 255.0, 100.0  # whole numbers between them are probabilities times 255
 LEAST_STEP = 1e-3  # voxels between a centre and the surface
-MOST_SHIFT = 0.2  # voxels by which a volume is put right at once
+MOST_SHIFT = 0.2  # voxels, the largest correction of a volume in one step
 VOLUME_STEPS = 2  # a third changes balls of 3 to 9 voxels by less than 0.1 %
-BAND_STEPS, BAND_WIDTH = 5, 2.9  # sweeps, and how far they have found distances whole: 5 steps along three axes
+BAND_STEPS, BAND_WIDTH = 5, 2.9  # sweeps, and the distance up to which they are complete: 5 steps along three axes
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     """Return a tissue's probabilities on the image's voxels, linear where they are on another grid.
 
-    Whole numbers above 100 and up to 255, as of files of bytes without a scale, are divided by 255, with a warning.
+    Whole numbers above 100 and up to 255, as in files of bytes without a scale, are divided by 255, with a warning.
 
     Parameters
     ----------
     tissue : Image
-        0 to 1, or whole numbers to 255.
+        Probabilities from 0 to 1, or whole numbers up to 255.
     image : Image
-        Whose voxels are taken.
+        Image with the target voxels.
     name : str, optional
-        What the tissue is called in messages.
+        Name of the tissue in messages.
 
     Returns
     -------
     Image
-        0 to 1, the image's shape and affine.
+        Probabilities from 0 to 1, with the image's shape and affine.
 
     Raises
     ------
     InputError
-        As `resample_contrast`; values of another range.
+        As for `resample_contrast`, or values out of range.
 
     Examples
     --------
@@ -70,14 +70,14 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     """
     low, high = tissue.range
     if PERCENT < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
-        warn(f"{name}: whole numbers to {high:g}, taken as probabilities times 255")
+        warn(f"{name}: whole numbers up to {high:g}, read as probabilities times 255")
         tissue = Image(tissue.data / BYTE_SCALE, tissue.affine)
     _check_range(name, tissue)
     return resample_contrast(tissue, image, name)
 
 
 def tissue_labels(tissues: Sequence[Image]) -> Image:
-    """Return the most probable tissue of each voxel: 1 to K in the order given, 0 where what is left is larger.
+    """Return the most probable tissue of each voxel: 1 to K in the given order, 0 where the remainder to 1 is larger.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def tissue_labels(tissues: Sequence[Image]) -> Image:
     Returns
     -------
     Image
-        Whole numbers; of several that are as probable the first, 0 before all.
+        Whole numbers; the first of equally probable tissues, with 0 before all others.
 
     Raises
     ------
     InputError
-        No tissue, probabilities of another range, or of another shape.
+        No tissues, probabilities out of range, or different shapes.
 
     Examples
     --------
@@ -105,13 +105,13 @@ def tissue_labels(tissues: Sequence[Image]) -> Image:
 
 
 def check_tissues(tissues: Sequence[Image]) -> None:
-    """InputError for what are no probabilities of tissues; a warning where they sum to more than 1."""
+    """Raise InputError for invalid probabilities of tissues; warn where they sum to more than 1."""
     if not 0 < len(tissues) <= LARGEST_LABEL:
         raise InputError(f"tissues: expected one image or more, got {len(tissues)}")
     for number, tissue in enumerate(tissues, 1):
         name = f"tissues, number {number}"
         if tissue.shape != tissues[0].shape:
-            raise InputError(f"{name}: expected shape {tissues[0].shape} as the first, got {tissue.shape}")
+            raise InputError(f"{name}: expected shape {tissues[0].shape} like the first, got {tissue.shape}")
         _check_range(name, tissue)
 
 
@@ -122,13 +122,13 @@ def warn_of_sums(tissues: Sequence[Image]) -> None:
         total += tissue.data
     if n_over := int(np.count_nonzero(total > 1.0 + SUM_TOLERANCE)):
         warn(
-            f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels, to {total.max():.3g} at "
-            "most; they are divided by their sum"
+            f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels (up to {total.max():.3g}); "
+            "they are divided by their sum"
         )
 
 
 def fractions(tissues: Sequence[Image]) -> NDArray[np.float32]:
-    """Probabilities that sum to 1, (K+1, *shape): first of what is left, which is 0 where the others sum to more."""
+    """Probabilities that sum to 1, (K+1, *shape): the remainder first, which is 0 where the others sum to more."""
     rows = np.empty((len(tissues) + 1, *tissues[0].shape), dtype=np.float32)
     for row, tissue in zip(rows[1:], tissues, strict=True):
         np.clip(tissue.data, 0.0, 1.0, out=row, casting="unsafe")
@@ -139,14 +139,14 @@ def fractions(tissues: Sequence[Image]) -> NDArray[np.float32]:
 
 
 def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Memberships:
-    """Of each tissue, and of what is left, the signed distance to its surface; of those that are the largest somewhere.
+    """Signed distances to the surfaces of the tissues and the remainder, for those most probable somewhere.
 
     Parameters
     ----------
     tissues : sequence of Image
         Probabilities from 0 to 1, on the same voxels.
     factors : sequence of int
-        Into how many a voxel is divided along each axis, as `supersampling` has them: probabilities are linear there.
+        Number of parts of a voxel along each axis, as from `supersampling`; probabilities are linear between centres.
     """
     n_voxels = tissues[0].data.size * int(np.prod(factors))
     check_memory(8.0 * (len(tissues) + 1) * n_voxels, f"{len(tissues)} tissues on {n_voxels} voxels", NO_ROOM)
@@ -155,7 +155,7 @@ def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Me
     values = np.flatnonzero(np.bincount(largest.ravel(), minlength=len(rows)))
     lost = sorted(set(range(1, len(rows))) - set(values.tolist()))
     if lost:
-        warn(f"tissues: in no voxel the most probable: number {', '.join(map(str, lost))}")
+        warn(f"tissues: most probable in no voxel: number {', '.join(map(str, lost))}")
     second = np.partition(rows, -2, axis=0)[-2]
     first = rows.max(axis=0)
 
@@ -172,18 +172,18 @@ def _check_range(name: str, tissue: Image) -> None:
     low, high = tissue.range
     if low < -RANGE_TOLERANCE or high > 1.0 + RANGE_TOLERANCE:
         raise InputError(
-            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; divide by the value that stands for "
-            "1, such as 100 or 255, first"
+            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; first divide by the value that "
+            "stands for 1, such as 100 or 255"
         )
 
 
 def _with_fractions(
     level: NDArray[np.float32], lead: NDArray[np.float32], inside: NDArray[np.bool_]
 ) -> NDArray[np.float32]:  # fmt: skip
-    """The level with the volume that the tissue has by its fractions of voxels; these keep their sides.
+    """Adjust the level to the volume that the tissue has by its fractions of voxels; voxels keep their sides.
 
-    Linear between centres, it would cut off what is round: 3 % of a ball of 6 voxels' radius. Where the lead jumps from
-    -1 to 1 the fraction of a voxel is the probability; where it rises slowly, it is told by where it is 0.
+    Linear between centres, it would cut round shapes, such as 3 % of a ball with a radius of 6 voxels. Where the lead
+    jumps from -1 to 1, the fraction of a voxel is the probability; where it rises slowly, its zero gives the fraction.
     """
     reach = scipy.ndimage.maximum_filter(lead, 3) - scipy.ndimage.minimum_filter(lead, 3)
     sharp = np.clip(reach - np.float32(1.0), 0.0, 1.0)
@@ -197,10 +197,10 @@ def _with_fractions(
 
 
 def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The signed distance, voxels, below 0 inside, to where `lead` is 0: it is linear between voxels, 0 or more inside.
+    """Signed distance, voxels, below 0 inside, to the zero of `lead`, which is linear between voxels and >= 0 inside.
 
-    The first order solution of |grad d| = 1, upwind (Sethian 1996, PNAS 93, 1591), in sweeps of all voxels. Along an
-    axis that crosses the surface beside a voxel the upwind place is the crossing, so that planes are exact there.
+    The first-order upwind solution of |grad d| = 1 (Sethian 1996, PNAS 93, 1591), in sweeps of all voxels. Along an
+    axis that crosses the surface beside a voxel, the upwind place is the crossing, so that planes are exact there.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
@@ -209,12 +209,12 @@ def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[n
     for _ in range(BAND_STEPS):
         np.minimum(distance, _upwind(distance, steps), out=distance)
     far = near_distance(inside) + near_distance(~inside) - np.float32(0.5)
-    distance = np.where(distance < BAND_WIDTH, distance, np.clip(far, BAND_WIDTH, FARTHEST_LEVEL))  # which is coarse
+    distance = np.where(distance < BAND_WIDTH, distance, np.clip(far, BAND_WIDTH, FARTHEST_LEVEL))  # `far` is coarse
     return np.where(inside, -distance, distance)
 
 
 def _crossing(lead: NDArray[np.float32], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float32]:
-    """The step from each voxel's centre along an axis, either way, to where the lead is 0; infinite beyond 1."""
+    """The step from each voxel's centre along an axis, either way, to the zero of the lead; infinite beyond 1."""
     step = np.full(inside.shape, np.inf, dtype=np.float32)
     along, own, side = (np.moveaxis(each, axis, 0) for each in (step, lead, inside))
     is_crossed = side[1:] != side[:-1]
@@ -226,7 +226,7 @@ def _crossing(lead: NDArray[np.float32], inside: NDArray[np.bool_], axis: int) -
 
 
 def _upwind(distance: NDArray[np.float32], steps: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The distance of each voxel by what is nearer along the axes: crossings, else neighbours, a step away."""
+    """Update the distance of each voxel from nearer places along the axes: crossings, or neighbours a step away."""
     near: list[tuple[NDArray, NDArray]] = []
     for axis, step in enumerate(steps):
         along = np.moveaxis(distance, axis, 0)
@@ -237,7 +237,7 @@ def _upwind(distance: NDArray[np.float32], steps: list[NDArray[np.float32]]) -> 
         is_crossed = step <= 1.0
         least[is_crossed] = 0.0
         near.append((least, np.float32(1.0) / np.where(is_crossed, step, np.float32(1.0)) ** 2))
-    for last in range(len(near) - 1, 0, -1):  # sorts them, faster than by voxel
+    for last in range(len(near) - 1, 0, -1):  # sorts them, faster than voxel by voxel
         for k in range(last):
             (low, weight), (high, other) = near[k], near[k + 1]
             is_less = low <= high
@@ -245,7 +245,7 @@ def _upwind(distance: NDArray[np.float32], steps: list[NDArray[np.float32]]) -> 
             near[k + 1] = np.where(is_less, high, low), np.where(is_less, other, weight)
     result: NDArray = near[0][0] + near[0][1] ** -0.5
     zeroth, first, second = near[0][1], near[0][1] * near[0][0], near[0][1] * near[0][0] ** 2
-    with np.errstate(invalid="ignore"):  # of axes of one voxel
+    with np.errstate(invalid="ignore"):  # axes of one voxel
         for value, weight in near[1:]:
             zeroth, first, second = zeroth + weight, first + weight * value, second + weight * value**2
             root = np.sqrt(np.maximum(first**2 - zeroth * (second - np.float32(1.0)), 0.0))

@@ -1,7 +1,7 @@
-"""Numbers of an image's voxels from one pass over boxes of them, so that the volume need not fit into memory.
+"""Statistics of an image's voxels from one pass over boxes, so that the volume need not fit into memory.
 
-Whatever is summed is summed along rows of the last axis first, and rows are added in their order: results are the same
-bits however the volume is cut into boxes, and whether it is stored or in memory.
+Sums run along rows of the last axis first, and rows are added in their order, so that results are the same to the last
+bit however the volume is divided into boxes, and whether it is stored or in memory.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from tetopt.contents.noise import NoiseSample, noise_places, sampled_noise
 from tetopt.image import Image, check_finite, check_intensities, check_kind, pieces
 from tetopt.system.budget import check_memory
 
-# Of the noise's planes, of each voxel: three times as doubles, and what second differences of them are made of.
+# Per voxel of the noise's planes: three doubles, and temporaries for their second differences.
 NOISE_PLANE_BYTES = 120.0
 
 
 class Statistics(NamedTuple):
-    """Of all voxels of a volume; made by `tetopt.contents.statistics.statistics`.
+    """Statistics of all voxels of a volume; made by `tetopt.contents.statistics.statistics`.
 
     Parameters
     ----------
     mean, low, high : float
-        Of the intensities.
+        Mean, least and greatest intensity.
     variance : float
-        Divided by the number of voxels.
+        Variance, normalised by the number of voxels.
     noise : float
-        Variance of the noise, as `Content.noise` of the image in memory has it, to the last bit.
+        Variance of the noise, equal to `Content.noise` of the image in memory to the last bit.
     scaled_noise : float
-        The same of the intensities less their mean, over their largest deviation from it.
+        The same for intensities minus their mean, divided by their largest deviation from it.
     is_whole : bool
-        Whether all are whole numbers.
+        True if all intensities are whole numbers.
 
     Examples
     --------
@@ -54,33 +54,33 @@ class Statistics(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """The largest deviation from the mean; 1 of a constant image."""
+        """The largest deviation from the mean; 1 for a constant image."""
         return max(abs(self.low - self.mean), abs(self.high - self.mean)) or 1.0
 
 
 def statistics(image: Image) -> Statistics:
-    """Statistics of a volume from one pass over its voxels, of which `octree_mesh` and parts need a few.
+    """Compute statistics of a volume, for `octree_mesh` and parts, in one pass over its voxels.
 
     Parameters
     ----------
     image : Image
-        In three dimensions; read by its boxes.
+        A 3-D image, read box by box.
 
     Returns
     -------
     Statistics
-        In the unit of the intensities, and its square.
+        In units of intensity, or its square.
 
     Raises
     ------
     InputError
-        Voxels that no `Image` takes: no real numbers, NaN or infinite, or too large to be squared.
+        Voxels that are invalid for an `Image`: not real numbers, NaN, infinite, or too large to be squared.
     """
     shape = image.shape
     check_kind(image.voxels.dtype)
     stride, middles = noise_places(shape)
     n_voxels, need = float(np.prod(shape, dtype=np.float64)), NOISE_PLANE_BYTES * len(middles) * shape[1] * shape[2]
-    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "turn its shortest axis to the last")
+    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "make its shortest axis the last")
     sums, squares = np.empty(shape[:2]), np.empty(shape[:2])
     near = np.empty((3, len(middles), *shape[1:]))
     places = np.unravel_index(np.arange(0, int(n_voxels), stride), shape)
@@ -112,7 +112,7 @@ def statistics(image: Image) -> Statistics:
     check_finite(n_bad, first_bad)
     check_intensities(low, high)
     mean = mean_of(sums, n_voxels)
-    # Of all voxels: within rows, and of the rows' means (Chan, Golub & LeVeque 1983).
+    # Variance of all voxels: within rows, and between the rows' means (Chan, Golub & LeVeque 1983).
     variance = (squares.sum() + shape[2] * ((sums / shape[2] - mean) ** 2).sum()) / n_voxels
     of_voxels = NoiseSample(sample, near)
     result = Statistics(mean, low, high, float(variance), sampled_noise(of_voxels) ** 2, 0.0, is_whole)
@@ -126,5 +126,5 @@ def row_sums(part: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mean_of(sums: NDArray[np.float64], n_voxels: float) -> float:
-    """The mean of so many voxels of which these are the sums of all rows, (s_0, s_1)."""
+    """The mean of `n_voxels` voxels from the sums of all rows, (s_0, s_1)."""
     return float(sums.sum() / n_voxels)

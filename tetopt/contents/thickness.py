@@ -1,11 +1,10 @@
-"""How thick labels are at each place: of the largest ball within a label that covers it, the diameter.
+"""Local thickness of labels: the diameter of the largest ball within a label that covers a place.
 
-The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67), between the smooth surfaces of labels
-(`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5 voxels has 1.5, where distances of voxels'
-centres would give 1 or 2. At a voxel in the middle of its label the diameter is the shortest of the 13 chords
-through it along axes and diagonals, each of which ends where another label's level is as small; times the cosine of
-its angle with the surfaces' normals, in the mean of both ends. Between facets it is the same, but that a chord ends
-where it crosses one.
+The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67) is measured between the smooth surfaces of
+labels (`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5 voxels has 1.5, where distances of
+voxel centres would give 1 or 2. At a voxel in the middle of its label, the diameter is the shortest of the 13 chords
+through it along axes and diagonals, times the cosine of its angle with the surfaces' normals (the mean of both ends).
+A chord ends where another label's level becomes as small; between facets, it ends where it crosses one.
 """
 
 from __future__ import annotations
@@ -24,26 +23,27 @@ from tetopt.geometry.vectors import cross, dot, minus, row, scaled
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
-THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # over its voxels, by which the thickness of a label is told
-THICKNESS_BYTES = 18.0  # at each voxel: chords, thickness, the labels, also those within a region
-CROSSING_BYTES = 2.0  # of each step
-BEYOND_REGION = -1  # in place of a label: beyond the region
-SLABS_PER_THREAD = 4  # of the grid for each thread: some take longer than others
-NO_CROSSING = 2**16 - 1  # of a step that no facet crosses
-COSINE_STEPS = 256  # of a cosine; a crossing has as many steps, and is their multiple
-LEAST_COSINE = 0.75  # between the shortest chord and a normal; less is at a crease, where there is none
-BESIDE_FRACTION = 1e-9  # of a triangle's size: so far beside it counts as in it
-OFF_MIDDLE_STEPS = 1.01  # by which the two ways along the shortest chord through a middle differ at most
+THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # percentiles over a label's voxels that describe its thickness
+THICKNESS_BYTES = 18.0  # per voxel: chords, thickness, the labels, and the labels within a region
+CROSSING_BYTES = 2.0  # per voxel and step
+BEYOND_REGION = -1  # stands for a label beyond the region
+SLABS_PER_THREAD = 4  # slabs of the grid per thread, as some take longer than others
+NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
+COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
+LEAST_COSINE = 0.75  # between the shortest chord and a normal; smaller at creases, which have no normal
+BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
+OFF_MIDDLE_STEPS = 1.01  # largest difference of the two ways along the shortest chord through a middle
 
 
 class _Labels(NamedTuple):
-    """Labels on a grid, as kernels take them."""
+    """Labels on a grid, as passed to kernels."""
 
-    partition: NDArray[np.int16]  # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to stay in caches
+    partition: NDArray[np.int16]  # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to fit into caches
     levels: NDArray[np.float32]  # (C, s_0, s_1, s_2)
     channel: NDArray[np.int64]  # (K,)
-    # (D, s_0, s_1, s_2) where facets cross each step up, 0 to 254, times 256, and the cosine of their angle, 0 to 255;
-    crossing: NDArray[np.uint16]  # empty where there are levels
+    # (D, s_0, s_1, s_2) place where facets cross each step up, 0 to 254, times 256, plus the cosine of the angle, 0 to
+    # 255;
+    crossing: NDArray[np.uint16]  # empty if there are levels
 
 
 def local_thickness(
@@ -54,13 +54,13 @@ def local_thickness(
     Parameters
     ----------
     members : Memberships
-        Of K labels on a grid.
+        Levels of K labels on a grid.
     spacing : (n,) float64
         Edges of its voxels, mm.
     most : float
-        What is thicker counts as so thick, mm.
+        Upper limit of the thickness, mm; larger values are clipped.
     inside : (*shape) bool, optional
-        The region within which labels are; its surface ends them.
+        The region of the labels; its surface ends them.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def local_thickness(
     Raises
     ------
     InputError
-        There is no memory for it.
+        Not enough memory for it.
     """
     check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
     partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
@@ -88,13 +88,13 @@ def thickness_between(
     Parameters
     ----------
     corners : (F, n, n) float64
-        Of each facet between two labels its nodes, mm from the centre of the first voxel, along the grid's axes.
+        Nodes of each facet between two labels, mm from the centre of the first voxel, along the grid's axes.
     partition : (s_0, ..., s_{n-1}) int64
-        Which label each voxel's centre has, any whole number from 0; -1 beyond the region.
+        Label of each voxel's centre, any whole number from 0; -1 beyond the region.
     spacing : (n,) float64
         Edges of the voxels, mm.
     most : float
-        Larger values are cut off at this one, mm.
+        Upper limit of the thickness, mm; larger values are clipped to it.
 
     Returns
     -------
@@ -112,9 +112,9 @@ def thickness_between(
     check_memory(
         (THICKNESS_BYTES + CROSSING_BYTES * len(steps)) * partition.size, "thickness of labels", "crop the image"
     )
-    if n == 2:  # a segment is a rectangle across the plane, of two triangles
+    if n == 2:  # a segment becomes a rectangle across the plane, of two triangles
         flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
-        flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and the second
+        flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and then the second
         corners = np.concatenate([flat[:, :3], flat[:, 1:]])
     crossing = np.full((len(steps), *whole), NO_CROSSING, dtype=np.uint16)
     _over_slabs(lambda slab: _fill_crossings(crossing, corners, steps * edges, edges, slab[3 - n], 3 - n), whole, n)
@@ -126,7 +126,7 @@ def _thickness(
     partition: NDArray[np.int64], levels: NDArray[np.float32], channel: NDArray[np.int64],
     crossing: NDArray[np.uint16], spacing: NDArray[np.float64], most: float,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """`local_thickness` of labels by row, -1 beyond the region, between levels or crossings on a grid in space."""
+    """`local_thickness` of labels by row (-1 beyond the region), between levels or crossings on a 3-D grid."""
     n = partition.ndim
     whole = (1,) * (3 - n) + partition.shape
     labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, crossing)
@@ -139,7 +139,7 @@ def _thickness(
 
 
 def _over_slabs(fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tuple[int, ...], n: int) -> None:
-    """Call a function of slabs of a grid, each of which is written to by one call, on all threads."""
+    """Call a function for each slab of a grid, on all threads; each call writes only to its slab."""
     ends = np.linspace(0, whole[3 - n], SLABS_PER_THREAD * numba.get_num_threads() + 1).astype(int).tolist()
     box = [(0, size) for size in whole]
     slabs = [(*box[: 3 - n], ends_of, *box[4 - n :]) for ends_of in itertools.pairwise(ends)]
@@ -148,7 +148,7 @@ def _over_slabs(fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tupl
 
 
 def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
-    """Steps (D, 3) along axes and diagonals, one of each two that are opposite, their lengths, and a voxel's edges."""
+    """Steps (D, 3) along axes and diagonals, one of each opposite pair, their lengths, and a voxel's edges."""
     n = len(spacing)
     edges = np.concatenate([np.ones(3 - n), spacing])
     steps = np.array([s for s in itertools.product((-1, 0, 1), repeat=3) if s > (0, 0, 0) and not any(s[: 3 - n])])
@@ -160,7 +160,7 @@ def _fill_chords(
     chord: NDArray, is_middle: NDArray, labels: _Labels, rays: tuple[NDArray, NDArray, NDArray], most: float,
     slab: tuple[tuple[int, int], ...],
 ) -> None:  # fmt: skip
-    """The shortest chord through each voxel of a slab, across its surfaces, and whether it is in the middle of it."""
+    """Fill in the shortest chord through each voxel of a slab, across its surfaces, and mark voxels in its middle."""
     steps, lengths, edges = rays
     for i in range(*slab[0]):
         for j in range(*slab[1]):
@@ -188,9 +188,10 @@ def _fill_chords(
 def _way(
     labels: _Labels, place: tuple[int, int, int], direction: tuple[int, NDArray], length: float, most: float
 ) -> float:
-    """From a voxel's centre to its label's surface along steps of a length, mm; `most` or more if it is further.
+    """Distance from a voxel's centre to its label's surface along steps of a length, mm; `most` or more if farther.
 
-    `direction` is its number and its step; those down have the numbers -1 to -D. A call would take twice as long as it.
+    `direction` is its number and its step; steps down have numbers -1 to -D. It is inlined: a call would take twice as
+    long as its body.
     """
     partition, levels, channel, crossing = labels
     (i, j, k), (d, step) = place, direction
@@ -205,7 +206,7 @@ def _way(
         other = partition[a, b, c]
         if other != own and len(crossing) > 0:
             part = crossing[d, i, j, k] if d >= 0 else crossing[-1 - d, a, b, c]
-            if part == NO_CROSSING:  # cells that overlap
+            if part == NO_CROSSING:  # overlapping cells
                 return way + 0.5 * length
             fraction = (part // COSINE_STEPS) / (COSINE_STEPS - 2.0)
             return float(way + length * (fraction if d >= 0 else 1.0 - fraction))
@@ -221,16 +222,16 @@ def _way(
 def _cosine(
     labels: _Labels, place: tuple[int, int, int], direction: tuple[int, NDArray], length: float, edges: NDArray
 ) -> float:
-    """Of the angle between a way to the label's surface, as of `_way`, and the normal there; 1 where that is unknown.
+    """Cosine of the angle between a way to the label's surface (`_way`) and the normal there; 1 if that is unknown.
 
-    Between levels the normal is along the gradient of the other label's.
+    Between levels the normal is along the gradient of the other label's level.
     """
     partition, levels, channel, crossing = labels
     (i, j, k), (d, step) = place, direction
     a, b, c = i + step[0], j + step[1], k + step[2]
     while True:
         is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
-        if not is_in or partition[a, b, c] < 0:  # a sum of two ways may be rounded to below one that leaves the grid
+        if not is_in or partition[a, b, c] < 0:  # rounding may put a sum of two ways below one that leaves the grid
             return 1.0
         if partition[a, b, c] != partition[i, j, k]:
             break
@@ -256,7 +257,7 @@ def _spread_balls(
     thickness: NDArray, chord: NDArray, is_middle: NDArray, partition: NDArray, edges: NDArray,
     slab: tuple[tuple[int, int], ...],
 ) -> None:  # fmt: skip
-    """Raise each voxel's thickness, in a slab, to the diameter of the largest ball around a middle that covers it."""
+    """Raise the thickness of a slab's voxels to the diameter of the largest ball around a middle that covers them."""
     for i in range(partition.shape[0]):
         for j in range(partition.shape[1]):
             for k in range(partition.shape[2]):
@@ -279,11 +280,11 @@ def _spread_balls(
 def _fill_crossings(
     crossing: NDArray, corners: NDArray, ways: NDArray, edges: NDArray, ends: tuple[int, int], axis: int
 ) -> None:
-    """Where triangles cross the ways (D, 3), mm, up from voxels' centres, the first of each; in a slab across an axis.
+    """Find where triangles first cross the ways (D, 3), mm, up from voxel centres, in a slab across an axis.
 
-    With the cosine of the angle between way and normal (`_Labels`).
+    The cosine of the angle between way and normal is stored, too (`_Labels`).
 
-    A triangle's height over a place is counted in lengths of its normal, which is no unit vector.
+    A triangle's height over a place is in lengths of its normal, which is not a unit vector.
     """
     first, last, rise = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(len(ways))
     lengths = np.sqrt((ways * ways).sum(axis=1))
@@ -317,7 +318,7 @@ def _fill_crossings(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_within(place: tuple[float, float, float], u: tuple[float, float, float], v: tuple[float, float, float]) -> bool:
-    """Whether a place in the plane of a triangle with one corner at the origin, u and v to the others, is in it."""
+    """True if a place in the plane of a triangle (corners 0, u and v) lies inside it."""
     uu, vv, uv, along_u, along_v = dot(u, u), dot(v, v), dot(u, v), dot(u, place), dot(v, place)
     square = uu * vv - uv * uv
     first, second = vv * along_u - uv * along_v, uu * along_v - uv * along_u

@@ -1,1 +1,1 @@
-"""The two error terms of the paper, E_G (Eq. 1) and E_D (Eq. 3), and the sampling they rest on."""
+"""The two error terms of the paper, E_G (Eq. 1) and E_D (Eq. 3), and the sampling that they use."""

@@ -14,14 +14,14 @@ from tetopt.mesh import Mesh
 def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
     """Each cell's contribution to E_D, (M,) float64, intensity^2 mm^n.
 
-    E_D = sum_j integral over cell j of (h - hbar_j)^2 with h constant on a voxel and each voxel counted whole in
-    the cell that holds its centre, hbar_j the cell's mean. So E_D lies between 0 and the image's own variance
-    times its volume, which is what one cell around everything would have. Cells without a voxel centre have 0.
+    E_D = sum_j integral over cell j of (h - hbar_j)^2, with h constant on a voxel, each voxel counted whole in
+    the cell that contains its centre, and hbar_j the cell's mean. So E_D lies between 0 and the image's variance
+    times its volume, the value of a single cell around everything. Cells without a voxel centre have 0.
 
     Raises
     ------
     InputError
-        As `tetopt.energy.sampling.cell_moments`.
+        As for `tetopt.energy.sampling.cell_moments`.
     """
     moments = cell_moments(image, mesh)
     return moments.n_voxels * moments.variance * image.voxel_volume
@@ -30,14 +30,14 @@ def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
 def E_D(image: Image, mesh: Mesh) -> float:
     """The discretization energy of equation (3), intensity^2 mm^n.
 
-    The sum over cells of the integral of (h - hbar)^2, hbar the mean of h over the cell. h is constant on a voxel, and
-    each voxel counts whole in the cell that holds its centre. It lies between 0 and the image's variance times its
-    volume.
+    The sum over cells of the integral of (h - hbar)^2, where hbar is the mean of h over the cell. h is constant on a
+    voxel, and each voxel counts whole in the cell that contains its centre. E_D lies between 0 and the image's variance
+    times its volume.
 
     Parameters
     ----------
     image : Image
-        The intensities h, 2-D or 3-D as the mesh is.
+        The intensities h, with the dimension of the mesh.
     mesh : Mesh
         Points in world mm.
 
@@ -49,18 +49,18 @@ def E_D(image: Image, mesh: Mesh) -> float:
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
 
     See Also
     --------
-    cell_moments : Mean and variance of each cell.
-    E_G : The energy of the cells' shapes.
+    cell_moments : Compute the mean and variance of each cell.
+    E_G : Compute the energy of the cells' shapes.
 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice_mesh(image, nodes=300)
-    >>> whole = float(image.data.var()) * image.volume  # what one cell for all would have
+    >>> whole = float(image.data.var()) * image.volume  # the value of a single cell
     >>> print(f"{tetopt.E_D(image, mesh) / whole:.2f}")
     0.07
     >>> graded = tetopt.mesh_image(image, 300, iterations=4).mesh
@@ -73,13 +73,13 @@ def E_D(image: Image, mesh: Mesh) -> float:
 def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     """E_D of a mesh over all channels of a content, intensity^2 mm^n, and the number of voxels in its cells.
 
-    It is what a run's history has: with a mask, each voxel on the wrong side of its surface counts
+    A run's history records this value: with a mask, each voxel on the wrong side of its surface adds
     `Content.wrong_side`.
 
     Raises
     ------
     InputError
-        As `tetopt.energy.sampling.cell_moments`.
+        As for `tetopt.energy.sampling.cell_moments`.
     """
     grid = channel_grid(content, mesh.points)
     ticks = to_ticks(content.image.to_index(mesh.points), grid)
@@ -88,7 +88,7 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     means = sums[:, [1, *range(3, 2 + len(content.values))]]
     within = sums[:, 2] - (means**2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
     squares = float(np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0).sum())
-    if content.region is not None:  # the last column: voxels outside less voxels inside
+    if content.region is not None:  # the last column: voxels outside minus voxels inside
         squares += content.wrong_side * (content.n_voxels + int(sums[:, -1].sum()))
     return squares * content.unit * content.image.voxel_volume, int(sums[:, 0].sum())
 

@@ -1,6 +1,6 @@
 """The geometric energy E_G: the interpolation error of the paraboloid x^2, Eq. (1) of the paper.
 
-The printed form, 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, subtracts two large numbers. Cell by cell it is
+The printed form, 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, subtracts two large numbers. For each cell it is
 the integral over the simplex of the linear interpolant of x^2 minus x^2 itself. With barycentric coordinates b_i
 that difference is sum_{i<k} b_i b_k |x_i - x_k|^2, and the mean of b_i b_k over a simplex is 1/((n+1)(n+2)), so
 
@@ -28,8 +28,8 @@ def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
 def E_G(points: Points, cells: Cells) -> float:
     """The geometric energy of equation (1), mm^(n+2).
 
-    The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2): small where cells are
-    round and of one size. It does not look at the image.
+    The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2). It is small if cells
+    are round and uniform, and independent of the image.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def E_G(points: Points, cells: Cells) -> float:
     Raises
     ------
     InputError
-        Points or cells that are no tables of numbers.
+        Points or cells that are not 2-D arrays of numbers.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def E_G(points: Points, cells: Cells) -> float:
 
 @njit(cache=True)
 def volume_and_E_G(x: NDArray, n_corners: int) -> tuple[float, float]:
-    """Unsigned volume and E_G of one cell, its corners x (4, 3) in mm; a triangle lies in coordinates 1 and 2."""
+    """Unsigned volume and E_G of a cell with corners x (4, 3) in mm; a triangle lies in coordinates 1 and 2."""
     edges = 0.0
     for i in range(n_corners):
         for k in range(i + 1, n_corners):

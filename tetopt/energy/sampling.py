@@ -1,22 +1,22 @@
-"""From voxels to cells: which voxel centre lies in which cell, and the sums of h over each cell.
+"""From voxels to cells: the cell that contains each voxel centre, and the sums of h over each cell.
 
 The contract: every voxel centre inside the mesh belongs to *exactly one* cell. Rounding cannot break it, because
-nothing here rounds. Nodes are taken to voxel-index space and put on a fixed-point grid of 2**-bits voxels
-(`to_ticks`; about 1e-6 voxel for a brain), so the side of a facet on which a voxel centre lies is the sign of an
-integer. A centre exactly on a facet, edge or node goes to the cell that would hold it if it were shifted by
-(eps^3, eps^2, eps) along the axes, eps infinitely small: one rule for all cells (simulation of simplicity,
+nothing here rounds. Nodes are mapped to voxel-index space and onto a fixed-point grid of 2**-bits voxels
+(`to_ticks`; about 1e-6 voxel for a brain), so that the side of a facet on which a voxel centre lies is the sign of an
+integer. A centre exactly on a facet, edge or node belongs to the cell that would contain it if it were shifted by
+(eps^3, eps^2, eps) along the axes, with eps infinitely small: one rule for all cells (simulation of simplicity,
 Edelsbrunner and Muecke 1990), under which no centre ever lies on a facet.
 
 Sums over a cell are taken on its facets, as in the divergence theorem. Along a row of voxels (the last axis) let
-P(k) be the sum over the row's first k voxels. A row that meets a cell enters it by one facet and leaves it by
-another; if the first voxel beyond each is k_in and k_out, the cell holds voxels k_in ... k_out - 1 of the row, and
-their sum is P(k_out) - P(k_in). So each facet has a *flux*, the sum of P(k) over the rows that cross it, signed by
-the side it faces, and the sum over a cell is the signed sum of its facets' fluxes. A facet's flux is found once for
-its two cells; what one cell gains there the other loses, so that totals are exact by construction; and when a node
+P(k) be the sum over the row's first k voxels. A row that meets a cell enters it through one facet and leaves it
+through another; if the first voxel beyond each is k_in and k_out, the cell contains voxels k_in ... k_out - 1 of the
+row, and their sum is P(k_out) - P(k_in). So each facet has a *flux*, the sum of P(k) over the rows that cross it,
+signed by the side it faces, and the sum over a cell is the signed sum of its facets' fluxes. A facet's flux is computed
+once for its two cells; one cell gains what the other loses, so that totals are exact by construction; and when a node
 moves, only the facets around it change. P is kept for 1, h and h^2.
 
-Where a facet cuts a row is found in float64, and settled in integers if that comes too close to a voxel centre.
-The facets of triangles are segments and go the same way; a 2-D image is given a leading axis of length 1.
+The place where a facet cuts a row is computed in float64, and in integers if it is too close to a voxel centre.
+The facets of triangles are segments and are treated alike; a 2-D image gets a leading axis of length 1.
 """
 
 from __future__ import annotations
@@ -55,23 +55,23 @@ from tetopt.system.kernels import (
     unit,
 )
 
-EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends an edge's cut is known to far less than the rest of 0.5
-SUM_BYTES = 12.0  # of each prefix sum at a voxel: 8, and temporary arrays
-ONE_CELL = 1 << 40  # in numbers of cells, from 1, that are added up: that there is one; see `_visited`
-CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task takes at once
+EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends, the error of an edge's cut is far below the remainder to 0.5
+SUM_BYTES = 12.0  # per prefix sum and voxel: 8, and temporary arrays
+ONE_CELL = 1 << 40  # counts one cell in sums of cell numbers from 1; see `_visited`
+CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task handles at once
 
 
 class CellMoments(NamedTuple):
-    """What each cell holds of the image, one row a cell.
+    """Moments of the image over each cell, one row per cell.
 
     Parameters
     ----------
     n_voxels : (M,) int64
         Voxel centres inside.
     mean : (M,) float64
-        Of h, intensity; in a cell without voxel centre, h at the centroid.
+        Mean of h, intensity; in a cell without voxel centre, h at the centroid.
     variance : (M,) float64
-        Of h around the mean, divided by `n_voxels`, intensity^2; 0 without voxel centre.
+        Variance of h, normalised by `n_voxels`, intensity^2; 0 without voxel centre.
 
     Examples
     --------
@@ -91,8 +91,8 @@ class CellMoments(NamedTuple):
 def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     """Count, mean and variance of the voxels whose centres lie in each cell.
 
-    The mean is the single value that stands for the cell in a finite-element model (Eq. 2). A cell smaller than
-    a voxel may hold no voxel centre: its mean is h at the centroid (the nearest voxel's value) and its variance 0.
+    The mean is the single value that represents the cell in a finite-element model (Eq. 2). A cell smaller than
+    a voxel may contain no voxel centre: its mean is h at the centroid (the nearest voxel's value) and its variance 0.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
 def cell_moments_and_ranges(
     image: Image, mesh: Mesh, bits: int | None = None
 ) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """`cell_moments` and `cell_ranges` in two thirds of the time; `bits` as of `sampling_grid`."""
+    """`cell_moments` and `cell_ranges` in two thirds of the time; `bits` as for `sampling_grid`."""
     sampled = _sampled(image, mesh, bits)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
@@ -146,7 +146,7 @@ def _sampled(image: Image, mesh: Mesh, bits: int | None = None) -> _Sampled:
 
 
 def _placed(image: Image, mesh: Mesh) -> _Sampled:
-    """As `_sampled`, of nothing: it only tells where cells lie."""
+    """Like `_sampled`, but without values: only the places of cells."""
     shape = (1,) * (3 - image.ndim) + image.shape
     return _on_grid(
         image, mesh, SamplingGrid(np.empty((*shape[:2], shape[2] + 1, 0)), grid_bits(image, mesh.points), 0)
@@ -165,7 +165,7 @@ def _moments(image: Image, mesh: Mesh, sampled: _Sampled) -> CellMoments:
     n_voxels = sums[:, 0].astype(np.int64)
     is_empty = n_voxels == 0
     count = np.maximum(sums[:, 0], 1.0)
-    offset = sums[:, 1] / count  # divided, not multiplied by 1 / count: the mean of equal whole numbers is that number
+    offset = sums[:, 1] / count  # unlike multiplying by 1 / count, gives the exact mean of equal whole numbers
     mean = grid.shift + offset
     variance = np.maximum(sums[:, 2] / count - offset**2, 0.0)
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
@@ -173,7 +173,7 @@ def _moments(image: Image, mesh: Mesh, sampled: _Sampled) -> CellMoments:
 
 
 def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
-    """Number of the cell that holds each voxel centre.
+    """Number of the cell that contains each voxel centre.
 
     Parameters
     ----------
@@ -185,12 +185,12 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     Returns
     -------
     (s_0, ..., s_{n-1}) int64
-        Of the image's shape; -1 outside of the mesh. Where cells overlap, the first of those that hold the voxel.
+        Cell numbers in the image's shape; -1 outside the mesh. Where cells overlap, the first that contains the voxel.
 
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
 
     Examples
     --------
@@ -209,13 +209,13 @@ class Overlap(NamedTuple):
 
     n_voxels: int
     voxel: tuple[int, ...]  # the index of one of them
-    cells: tuple[int, int]  # two cells that hold it
+    cells: tuple[int, int]  # two cells that contain it
 
     def __str__(self) -> str:
-        """Return the sentence that a message has of it."""
+        """Return a sentence for a message."""
         return (
-            f"cells overlap: {self.n_voxels} voxels lie in several of them; cells {self.cells[0]} and {self.cells[1]} "
-            f"both hold voxel {list(self.voxel)}"
+            f"cells overlap: {self.n_voxels} voxels lie in several cells; cells {self.cells[0]} and {self.cells[1]} "
+            f"both contain voxel {list(self.voxel)}"
         )
 
 
@@ -225,7 +225,7 @@ def overlap_of(image: Image, mesh: Mesh) -> Overlap | None:
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
     """
     n_voxels, *rest = _visited(mesh, _placed(image, mesh)).shared.tolist()
     voxel, cells = rest[3 - image.ndim : 3], rest[3:]
@@ -233,11 +233,11 @@ def overlap_of(image: Image, mesh: Mesh) -> Overlap | None:
 
 
 class _Visited(NamedTuple):
-    """What a visit of each cell's voxels finds."""
+    """Results of visiting each cell's voxels."""
 
     owner: NDArray[np.int64]  # (s_0, s_1, s_2) the cell of each voxel, the first of several; -1 for none
     low: NDArray[np.float64]  # (M,) least intensity of each cell's voxels, inf without any
-    high: NDArray[np.float64]  # (M,) the greatest, likewise
+    high: NDArray[np.float64]  # (M,) greatest intensity, -inf without any
     shared: NDArray[np.int64]  # (6,) number of voxels in several cells, the index of one, and two of its cells
 
 
@@ -247,9 +247,9 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     n_cells, hand = len(mesh.cells), _hand(ticks, mesh.cells)
     low, high, shared = np.full(n_cells, np.inf), np.full(n_cells, -np.inf), np.zeros(6, dtype=np.int64)
     steps = np.zeros(grid.prefix.shape[:3], dtype=np.int64)
-    rows = steps[..., None]  # only their shape matters where nothing is summed: one kind of volume for all images
-    # Crossing a facet upwards, a row changes from the cells below to the cells above: the differences of how many they
-    # are, and of the sums of their numbers, added up along the row, are those of the cells that it is in.
+    rows = steps[..., None]  # without sums only their shape matters: one kind of volume for all images
+    # Crossing a facet upwards, a row changes from the cells below to the cells above. The changes of the cells' count
+    # and of the sum of their numbers, accumulated along the row, give those of the cells that contain each voxel.
     of_cell, signs = sides.of_cell.ravel(), -hand * sides.sign
     numbers = signs * np.arange(1, n_cells + 1)[:, None]
     # Sums of whole numbers below 2^53 are exact in float64.
@@ -259,7 +259,7 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     owner = np.empty(grid.shape, dtype=np.int64)
     volume = np.zeros(grid.shape, dtype=np.float32) if h is None else h.reshape(grid.shape)
     shared[0] = _fill_owners(owner, low, high, steps, volume)
-    if shared[0] > 0:  # numbers that are sums of several say nothing
+    if shared[0] > 0:  # sums of several numbers are meaningless
         steps[:], owner[:], low[:], high[:] = 0, -1, np.inf, -np.inf
         cells = _Cells(ticks, np.ascontiguousarray(mesh.cells), sides.nodes, sides.of_cell, signs, grid.bits)
         _visit_cells(owner, low, high, shared, cells, volume, steps, rows)
@@ -269,12 +269,12 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
 def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The least and the greatest intensity among the voxels whose centres lie in each cell, (M,) float64 each.
 
-    In a cell without any both are the nearest voxel's, as in `cell_moments`.
+    In a cell without voxel centre both are the nearest voxel's value, as in `cell_moments`.
 
     Raises
     ------
     InputError
-        As `cell_moments`.
+        As for `cell_moments`.
     """
     return _ranges(image, mesh, _sampled(image, mesh))
 
@@ -289,8 +289,8 @@ def _ranges(image: Image, mesh: Mesh, sampled: _Sampled) -> tuple[NDArray[np.flo
 def ranges_of(
     owner: NDArray[np.int64], h: NDArray[np.floating], n_cells: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and greatest of the values (K,) that each cell owns, inf and -inf where it owns none, (M,) float64."""
-    # Runs of voxels of one cell first: `ufunc.at` on each voxel takes twice as long (MNI152 T1, 15,000 nodes).
+    """Least and greatest of the values (K,) that each cell owns, (M,) float64; inf and -inf if it owns none."""
+    # Runs of voxels of one cell are reduced first: `ufunc.at` by voxel takes twice as long (MNI152 T1, 15,000 nodes).
     start = np.flatnonzero(np.concatenate([[True], owner[1:] != owner[:-1]]))
     inside = owner[start] >= 0
     cell = owner[start][inside]
@@ -301,22 +301,22 @@ def ranges_of(
 
 
 def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Value of the voxel nearest to each world point, (K,) float64; points outside take the border's."""
+    """Value of the voxel nearest to each world point, (K,) float64; points outside get the border's value."""
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
 
 
 def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of the voxel nearest to each world point, (K, n) int64; points outside take the border's."""
+    """Index of the voxel nearest to each world point, (K, n) int64; points outside get the border's voxel."""
     index = np.rint(image.to_index(points)).astype(np.int64)
     return np.clip(index, 0, np.array(image.shape) - 1)
 
 
 class SamplingGrid(NamedTuple):
-    """An image made ready for the kernels."""
+    """An image prepared for the kernels."""
 
     prefix: NDArray  # (s_0, s_1, s_2 + 1, 2) sums of h - shift and its square over a row's first k voxels
     bits: int  # node coordinates are integers in units of 2**-bits voxel
-    shift: float  # taken off h before it is squared, so that sums of squares lose no digits
+    shift: float  # subtracted from h before squaring, so that sums of squares lose no digits
     n_channels: int = 1  # see `channel_grid`
 
     @property
@@ -328,11 +328,11 @@ class SamplingGrid(NamedTuple):
 def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
 
-    Of an image that is a part of another one `bits` are those of the other one's grid, which are no more.
+    If the image is a part of another one, `bits` are those of the other one's grid, which are no more.
 
     Differences of coordinates stay below 2**29 units, so that their products, areas and determinants are exact
-    in 64- and 128-bit integers. On an image of whole numbers whose sums of squares along a row stay below 2**31,
-    8-bit and most 16-bit images, every sum is exact, too; on others sums are as exact as float64 sums along a row.
+    in 64- and 128-bit integers. On an image of whole numbers whose sums of squares along a row stay below 2**31
+    (8-bit and most 16-bit images), every sum is exact, too; on others sums are as exact as float64 sums along a row.
 
     Raises
     ------
@@ -344,7 +344,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = 
     (low, high), mean, is_whole = image.range, image.mean, image.is_whole
     shift = low if low == high else round(mean) if is_whole else mean  # constants become 0, whole numbers stay whole
     largest = max(high - shift, shift - low)
-    # Whole numbers whose sums fit take half the memory, which is what the sampling of small cells waits for:
+    # Whole numbers whose sums fit take half the memory, whose access limits the sampling of small cells:
     # 1.4 times faster at 200 k tetrahedra.
     is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
     _check_grid(shape, 2)
@@ -359,7 +359,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = 
 
 
 def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
-    """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as `sampling_grid`."""
+    """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as for `sampling_grid`."""
     if points.shape[1] != image.ndim:
         raise InputError(
             f"mesh and image: expected the same dimension, got a {points.shape[1]}-D mesh and a {image.ndim}-D image"
@@ -368,20 +368,20 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     bits = 28 - ceil(log2(reach))
     if bits < 8:
         raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in the same mm?"
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in world mm?"
         )
     return bits
 
 
 def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
-    """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares, of the others.
+    """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares, and of the others.
 
-    With a region last those of 1 for each voxel outside of it and -1 for each inside.
+    With a region, the last sums count 1 for each voxel outside it and -1 for each inside.
 
     Raises
     ------
     InputError
-        As `sampling_grid`.
+        As for `sampling_grid`.
     """
     grid = sampling_grid(content.image, points, bits)
     if content.is_plain and content.region is None:
@@ -404,10 +404,10 @@ def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None
 
 
 def _check_grid(shape: Sequence[int], n_sums: int) -> None:
-    """InputError for prefix sums that there is no memory for: of 64 bits, and once more while they are made."""
+    """Raise InputError if prefix sums do not fit into memory: 64 bits each, and as much while they are computed."""
     n_voxels = prod(shape)
     what = f"image: {n_sums} sums of {' x '.join(map(str, shape))} voxels"
-    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop it, or mesh it with larger voxels")
+    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop the image, or resample it to larger voxels")
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
@@ -424,7 +424,7 @@ def from_ticks(ticks: NDArray[np.int64], grid: SamplingGrid, n: int) -> NDArray[
 
 @contextmanager
 def few_threads(tasks: int) -> Iterator[None]:
-    """No more threads inside than `tasks` are worth, one for every 2000; the results do not depend on it.
+    """Use one thread per 2000 `tasks` at most; results do not depend on it.
 
     Waking a second thread for a mesh of a hundred cells costs more than its work: on a busy machine 61 nodes took
     20 times as long on two threads as on one.
@@ -438,13 +438,13 @@ def few_threads(tasks: int) -> Iterator[None]:
 
 
 def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> None:
-    """InputError unless every cell, positive in the world, is so on the fixed-point grid too."""
+    """Raise InputError unless every cell, positive in the world, is positive on the fixed-point grid, too."""
     hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
     wrong = np.flatnonzero(orientations(ticks, cells) != hand)
     if len(wrong):
         raise InputError(
             f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, the first are "
-            f"{wrong[:5].tolist()}; remove or mend them before sampling"
+            f"{wrong[:5].tolist()}; remove or repair them before sampling"
         )
 
 
@@ -456,10 +456,10 @@ def orientations(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[
 def moment_sums(
     grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], sides: Facets | None = None
 ) -> NDArray[np.float64]:
-    """Voxel count, sum of (h - shift) and sum of its square over each cell, (M, 3) float64; of more channels, (M, D).
+    """Voxel count, sum of (h - shift) and of its square over each cell, (M, 3) float64; with more channels, (M, D).
 
-    They add up: the sums of a set of cells are the sum of their rows. Counts are whole numbers, exact. `sides` are
-    the cells' facets where they are known already.
+    They are additive: the sums of a set of cells are the sum of their rows. Counts are exact whole numbers. `sides` are
+    the cells' facets, if already known.
     """
     sides = facets(cells) if sides is None else sides
     n_sums = grid.prefix.shape[3] + 1
@@ -474,7 +474,7 @@ def moment_sums(
 
 
 def _hand(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> int:
-    """Sign of the first cell's volume in index space: that of all of them in a mesh that can be sampled."""
+    """Sign of the first cell's volume in index space, which all cells of a valid mesh share."""
     return int(_orientations(ticks, np.ascontiguousarray(cells[:1], dtype=np.int64))[0])
 
 
@@ -482,7 +482,7 @@ def _hand(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> int:
 
 
 class Volume(NamedTuple):
-    """A sampling grid as kernels get it: its prefix sums are of 32 or of 64 bits, and the others have no voxel."""
+    """A sampling grid for kernels: prefix sums of 32 or 64 bits, with an empty array for the other kind."""
 
     long: Floats4
     short: Shorts4
@@ -501,12 +501,12 @@ def _volume(prefix: NDArray, bits: int) -> Volume:
 
 
 class _Filling(NamedTuple):
-    """The sums to be filled in, and what of."""
+    """The sums to fill in, and their inputs."""
 
     volume: Volume
-    data: Floats3  # of the image, unless they are of 32 bits; one voxel of nothing then
-    single: Singles3  # likewise
-    is_single: bool  # which of them it is
+    data: Floats3  # prefix sums of 64 bits, or one empty voxel if they have 32
+    single: Singles3  # prefix sums of 32 bits, or one empty voxel
+    is_single: bool  # True if they have 32 bits
     shift: float
 
 
@@ -544,7 +544,7 @@ def _fill_rows(prefix: NDArray, volume: NDArray, shift: float, i: int) -> None:
 def dot_sign(n: tuple, d: tuple) -> int:
     """Exact sign of n . d, with |n| < 2**60 and |d| < 2**30: the products need up to 90 bits.
 
-    Each n is cut into a high part and 30 low bits, and the two dot products are added with carry.
+    Each n is split into a high part and 30 low bits, and the two dot products are added with carry.
     """
     mask = (1 << 30) - 1
     low = dot((n[0] & mask, n[1] & mask, n[2] & mask), d)
@@ -608,10 +608,10 @@ def _by_first_axis(a: tuple, b: tuple, c: tuple) -> tuple:
     return a, b, c
 
 
-# In registers: with six more channels a facet takes 180 ns, not 218 (400, not 533, of 40 rows).
+# In registers: with six more channels a facet takes 180 ns, not 218 (with 40 rows 400, not 533).
 @njit(cache=True)
 def _with_row(more: tuple, prefix: NDArray, i: int, j: int, k: int, n_more: int) -> tuple:
-    """The sums of up to six more channels with one row's."""
+    """Add one row to the sums of up to six more channels."""
     s, t, u, v, w, x = more
     s += prefix[i, j, k, 2]
     if n_more > 1:
@@ -633,31 +633,31 @@ def triangle_flux(
 ) -> None:
     """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
-    It is positive where the triangle, its nodes as listed, faces up the last axis, and goes to out[p, q, :], where
-    `place` is (p, q), one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change, the
-    change, signed as the flux, is added to the steps at each crossing.
+    It is positive if the triangle, with its nodes as listed, faces up the last axis, and is written to out[p, q, :],
+    where `place` is (p, q), with one entry more than `prefix` has. If `scatter` is an array of steps and a change, the
+    change, signed like the flux, is added to the steps at each crossing instead.
     """
     (node_a, node_b, node_c), (p, q) = nodes, place
     n_more = out.shape[2] - 3
     out[p, q, :] = 0.0
     n = cross(difference(ticks, node_b, node_a), difference(ticks, node_c, node_a))
-    if n[2] == 0:  # it stands along the rows: none crosses it
+    if n[2] == 0:  # it is parallel to the rows, so none crosses it
         return
     sign = 1 if n[2] > 0 else -1
     n = (sign * n[0], sign * n[1], sign * n[2])
-    # Corners in the order of axis 0: on each line one cut is on the long edge a-c, the other on a-b, then on b-c.
+    # With corners in the order of axis 0, each line has one cut on the long edge a-c, the other on a-b, then on b-c.
     a, b, c = _by_first_axis(row(ticks, node_a), row(ticks, node_b), row(ticks, node_c))
     n_i, n_j, n_k, scale = prefix.shape[0], prefix.shape[1], prefix.shape[2] - 1, 2.0**-bits
     first, last = max(-((-a[0]) >> bits), 0), min(-((-c[0]) >> bits), n_i)
     middle = min(max(-((-b[0]) >> bits), first), last)
-    # The facet cuts row (i, j) at a2 + slope0 (i - a0) + slope1 (j - a1), terms no larger than `size`.
+    # The facet cuts row (i, j) at a2 + slope0 (i - a0) + slope1 (j - a1), with terms no larger than `size`.
     slope0, slope1 = -(n[0] / n[2]), -(n[1] / n[2])
     at = (a[0] * scale, a[1] * scale, a[2] * scale)
     size = abs(slope0) * (c[0] - a[0]) + abs(slope1) * (abs(b[1] - a[1]) + abs(c[1] - a[1]))
     error = 1e-9 + 4e-15 * scale * size
     margin = 0.5 - error if error < 0.25 else -1.0
     lowest, highest = min(a[2], b[2], c[2]) >> bits, -((-max(a[2], b[2], c[2])) >> bits)
-    zero = 0 * prefix[0, 0, 0, 0]  # of whole numbers whole
+    zero = 0 * prefix[0, 0, 0, 0]  # an integer for integer sums
     count, sum_1, sum_2 = 0, zero, zero
     more = (zero, zero, zero, zero, zero, zero)
     long0, long1 = c[0] - a[0], c[1] - a[1]
@@ -667,7 +667,7 @@ def triangle_flux(
         d0, d1 = v[0] - u[0], v[1] - u[1]
         slope, base = scale * (d1 / max(d0, 1)), scale * u[1]
         for i in range(begin, end):
-            # Both cuts before either is settled, and that by a call: so this takes two thirds of the time.
+            # Computing both cuts first, and exact ones in a call, takes two thirds of the time.
             cut_1, cut_2 = at[1] + ((i << bits) - a[0]) * long_slope, base + ((i << bits) - u[0]) * slope
             up_1, up_2 = np.ceil(cut_1), np.ceil(cut_2)
             one: Any = np.int64(up_1)
@@ -684,7 +684,7 @@ def triangle_flux(
                 if abs(up - cut - 0.5) > margin:
                     k = _exact_facet_threshold(n, a, bits, i, j, lowest, highest)
                 k = min(max(k, 0), n_k)
-                if scatter is None:  # numba compiles only the branch that is taken
+                if scatter is None:  # numba compiles only the branch taken
                     count += k
                     sum_1 += prefix[i, j, k, 0]
                     sum_2 += prefix[i, j, k, 1]
@@ -703,7 +703,7 @@ def triangle_flux(
 def segment_flux(
     ticks: NDArray, nodes: tuple, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, place: tuple
 ) -> None:
-    """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; as `triangle_flux`."""
+    """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; like `triangle_flux`."""
     (node_a, node_b), (p, q) = nodes, place
     n_more = out.shape[2] - 3
     for d in range(3 + n_more):
@@ -740,7 +740,7 @@ def segment_flux(
 def facet_flux(
     ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int
 ) -> None:
-    """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `triangle_flux`."""
+    """Write the flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
         segment_flux(ticks, (a, b), bits, prefix, scatter, out, (p, 0))
@@ -749,7 +749,7 @@ def facet_flux(
 
 
 class _Fluxes(NamedTuple):
-    """The fluxes to be filled in, and what of."""
+    """The fluxes to fill in, and their inputs."""
 
     fluxes: Floats3
     ticks: Ints2
@@ -759,7 +759,7 @@ class _Fluxes(NamedTuple):
 
 @unit
 def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, volume: Volume) -> None:
-    """Flux of the facet (a, b, c), or (a, b) with c < 0, to out[p, q, :]."""
+    """Write the flux of the facet (a, b, c), or (a, b) if c < 0, to out[p, q, :]."""
     if c < 0:
         if volume.is_short:
             segment_flux(ticks, (a, b), volume.bits, volume.short, None, out, (p, q))
@@ -780,7 +780,7 @@ def _fill_fluxes(work: _Fluxes, chunk: int) -> None:
 
 
 class _Sums(NamedTuple):
-    """The sums to be filled in, and what of."""
+    """The sums to fill in, and their inputs."""
 
     sums: Floats2
     fluxes: Floats2
@@ -797,7 +797,7 @@ def _fill_sums(work: _Sums, chunk: int) -> None:
             total = 0.0
             for k in range(of_cell.shape[1]):
                 total += sign[cell, k] * fluxes[of_cell[cell, k], d]
-            is_rounding = d > 0 and sums[cell, 0] <= 0.0  # what is left without voxels
+            is_rounding = d > 0 and sums[cell, 0] <= 0.0  # residue of a cell without voxels
             sums[cell, d] = 0.0 if is_rounding else work.hand * total
 
 
@@ -810,9 +810,9 @@ def _scatter_changes(steps: Ints3, change: Ints1, ticks: Ints2, nodes: Ints2, bi
 
 @entry
 def _fill_owners(owner: Ints3, low: Floats1, high: Floats1, steps: Ints3, volume: Singles3) -> int:
-    """Find the cell of each voxel, and the range of each cell's, from the steps along rows: half the time of passes.
+    """Find the cell of each voxel, and each cell's range, from the steps along rows, in half the time of passes.
 
-    How many voxels are in several cells: if any, nothing else of it counts.
+    Also count the voxels in several cells: if there are any, the other results are invalid.
     """
     n_shared = 0
     for i in range(volume.shape[0]):
@@ -835,15 +835,15 @@ class _Cells(NamedTuple):
 
     ticks: Ints2
     cells: Ints2
-    nodes: Ints2  # of the facets
+    nodes: Ints2  # nodes of the facets
     of_cell: Ints2  # its facets
-    signs: Ints2  # by how much the row that goes up through each of them is in the cell then
+    signs: Ints2  # change of the number of times a row is in the cell as it passes up through each facet
     bits: int
 
 
 @helper
 def _span(mesh: _Cells, cell: int, axis: int, n: int) -> tuple:
-    """The first and the last of the n voxels along an axis between which a cell's facets can cross rows."""
+    """The first and last of the n voxels along an axis where a cell's facets can cross rows."""
     ticks, cells, bits = mesh.ticks, mesh.cells, mesh.bits
     low = high = ticks[cells[cell, 0], axis]
     for k in range(1, cells.shape[1]):
@@ -855,9 +855,9 @@ def _span(mesh: _Cells, cell: int, axis: int, n: int) -> tuple:
 def _visit_cells(
     owner: Ints3, low: Floats1, high: Floats1, shared: Ints1, mesh: _Cells, volume: Singles3, steps: Ints3, rows: Ints4
 ) -> None:  # fmt: skip
-    """Find the voxels of each cell by its own facets alone, of overlapping cells, in four times the time.
+    """Find the voxels of overlapping cells by each cell's own facets, in four times the time.
 
-    `owner` is -1 before, and `steps` are 0 before and after.
+    `owner` is -1 before, and `steps` is 0 before and after.
     """
     unused = np.empty((1, 1, 3))
     n_i, n_j, n_k = volume.shape

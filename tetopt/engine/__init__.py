@@ -1,1 +1,1 @@
-"""Moving and connecting the nodes: the loop both engines share, the fast engine, the paper's."""
+"""Optimisation of node positions and connectivity: the fast engine, the paper's, and their common loop."""

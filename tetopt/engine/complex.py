@@ -1,13 +1,12 @@
-"""One cell complex in plain arrays, kept whole while nodes move and cells are exchanged.
+"""A cell complex in plain arrays, kept consistent while nodes move and cells are exchanged.
 
-A cell's facet k lies opposite its corner k. For each facet the complex holds the cell across it and the facet's flux
-(see `tetopt.energy.sampling`), turned outwards and multiplied by the sign of index space, so that a cell's moment
-sums are the plain sum over its facets and the two sides of a facet hold opposite numbers. Local operations then only
-measure the facets that are new.
+A cell's facet k lies opposite its corner k. For each facet the complex stores the cell across it and the facet's
+outward flux (see `tetopt.energy.sampling`) times the sign of index space, so that a cell's moment sums are the plain
+sum over its facets and the two sides of a facet have opposite numbers. Local operations then only measure new facets.
 
-The D sums of a cell are the number of its voxels, the sum of the first channel's values, that of the squares of all
-channels, the sums of the other channels' values and, if the mesh covers a mask only, the voxels outside of the mask
-less those inside.
+The D sums of a cell are the number of its voxels, the sum of the first channel's values, the sum of all channels'
+squares, the sums of the other channels' values and, if the mesh covers only a mask, the voxels outside the mask minus
+those inside.
 """
 
 from __future__ import annotations
@@ -37,32 +36,32 @@ from tetopt.system.kernels import (
     unit,
 )
 
-# A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
+# A cell's volume over (sum of squared edges)^(n/2), below which it counts as inverted: an angle of 1e-3 degrees.
 FLAT_FRACTION = 1e-7
-NODE_ROWS = ("ticks", "is_frozen", "meeting", "band")  # of a `Complex`: one row for each node
-CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # of a `Complex`: one row for each cell
+NODE_ROWS = ("ticks", "is_frozen", "meeting", "band")  # fields of a `Complex` with one row per node
+CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # fields of a `Complex` with one row per cell
 
 
 class Complex(NamedTuple):
-    """Nodes, cells, who touches whom, and what each cell holds. Rows from `n_cells` on are room for more cells."""
+    """Nodes, cells, their adjacency, and each cell's sums. Rows from `n_cells` are space for more cells."""
 
     ticks: Ints2  # (N, 3) node positions on the sampling grid
-    is_frozen: Bools2  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
-    meeting: Ints2  # (N, 4) labels of the cells around each node, where there are two or more; else -1
-    band: Floats1  # (N,) how far each node may be off the surface between two labels, voxels
+    is_frozen: Bools2  # (N, 4) axes along which each node is fixed; last column: on the mask's surface
+    meeting: Ints2  # (N, 4) labels of the cells around each node if there are two or more; else -1
+    band: Floats1  # (N,) distance that each node may be off the surface between two labels, voxels
     cells: Ints2  # (C, n+1) corners, positively oriented in the world
-    labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 as long as none are given
+    labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 until labels are assigned
     across: Ints2  # (C, n+1) the cell beyond each facet; -1 outside
-    fluxes: Floats3  # (C, n+1, D) of each facet, outwards
+    fluxes: Floats3  # (C, n+1, D) outward flux of each facet
     sums: Floats2  # (C, D) moment sums: their sum over the facets
     E_shape: Floats1  # (C,) shape energy, see `shape_energy`
     n_cells: Ints1  # (1,) rows in use
 
 
 class Objective(NamedTuple):
-    """What turns a cell into an energy."""
+    """Weights and parameters of a cell's energy."""
 
-    volume: Volume  # of the sampling grid
+    volume: Volume  # the sampling grid's volume
     bits: int
     hand: int  # sign of the cells' volumes in index space
     matrix: Floats2  # (3, 3) index vectors to mm
@@ -71,35 +70,35 @@ class Objective(NamedTuple):
     surface: float  # weight of a voxel on the wrong side of the mask's surface; 0 without a mask
     n_channels: int
     power: float  # p of the shape energy
-    is_graded: bool  # whether every cell's shape counts the same, whatever its size
+    is_graded: bool  # True if every cell's shape has the same weight, whatever its size
     angle_limit: float  # minus the cosine of the minimum dihedral angle; -1 for none
-    safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above that angle
-    rounding: float  # a sum of squares up to this, over all cells, is only rounding
-    wrong_side: float  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
-    n_means: int  # the first channels, of which a cell has its mean; of the others it has what its label says
-    own_column: Ints1  # (K,) for each label the column of a cell's sums that is its channel's
-    own_value: Floats1  # (K,) and its value there; 0 in the other channels of labels
-    bias: Floats1  # (K,) what a label is worth besides, as a fraction of a cell's voxels; see `tetopt.engine.labelling`
-    shift: Floats1  # (K,) how far out each label's surface is, in its level, voxels; see `tetopt.engine.interfaces`
+    safe: float  # a tetrahedron is above that angle if its S^3 is at most this times its squared determinant
+    rounding: float  # a total sum of squares up to this is only rounding
+    wrong_side: float  # penalty of a voxel on the wrong side of the mask's surface, in squares; see `surface`
+    n_means: int  # leading channels for which a cell has its mean; in the others its label sets the value
+    own_column: Ints1  # (K,) column of a cell's sums for each label's channel
+    own_value: Floats1  # (K,) the label's value there; 0 in the other channels of labels
+    bias: Floats1  # (K,) bonus of a label, as a fraction of a cell's voxels; see `tetopt.engine.labelling`
+    shift: Floats1  # (K,) outward shift of each label's surface, in its level, voxels; see `tetopt.engine.interfaces`
     tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 
 class Sides(NamedTuple):
-    """Where nodes may be put on the boundary: the box's sides, the mask's surface."""
+    """Places of boundary nodes: the box's sides and the mask's surface."""
 
     low: Ints1  # (3,) ticks of the box's sides
     high: Ints1
-    is_fixed: bool  # whether boundary nodes stay where they are
-    has_surface: bool  # whether what is not on the box's sides is on the mask's surface
-    level: Singles3  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
-    levels: Singles4  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without
-    channel: Ints1  # (K,) which of them is each label's
+    is_fixed: bool  # True if boundary nodes are fixed
+    has_surface: bool  # True if boundary nodes off the box's sides lie on the mask's surface
+    level: Singles3  # (s_0, s_1, s_2) level function of the mask; (1, 1, 1) without one
+    levels: Singles4  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without any
+    channel: Ints1  # (K,) level function of each label
     projections: Floats3  # see `tetopt.engine.state.free_projections`
     inverse: Floats2  # (3, 3) mm to index vectors
 
 
 class State(NamedTuple):
-    """What the kernels carry together; made by `tetopt.engine.state.state_of`."""
+    """Complex, objective and boundary for the kernels; made by `tetopt.engine.state.state_of`."""
 
     complex: Complex
     objective: Objective
@@ -109,9 +108,9 @@ class State(NamedTuple):
 def build(
     cells: NDArray[np.int64], ticks: NDArray[np.int64], is_frozen: NDArray[np.bool_], objective: Objective, sides: Sides
 ) -> State:
-    """The state of a conforming mesh, everything measured.
+    """Build the state of a conforming mesh and measure everything.
 
-    `ticks` and `is_frozen` are kept, not copied. The cells must be a mesh: at most two to a facet (`check_mesh`).
+    `ticks` and `is_frozen` are kept, not copied. At most two cells may share a facet (`check_mesh`).
     """
     n_cells, n_corners = cells.shape
     room = n_cells + n_cells // 4 + 64
@@ -137,7 +136,7 @@ def build(
 
 
 def remeasure(state: State) -> None:
-    """Fluxes, sums and shape energies of all cells, afresh."""
+    """Recompute fluxes, sums and shape energies of all cells."""
     with few_threads(int(state.complex.n_cells[0]) * 4):
         n_chunks, laid_out = (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, packed(state)
         run(_measure_cells, n_chunks, laid_out)
@@ -145,12 +144,12 @@ def remeasure(state: State) -> None:
 
 
 def copied(state: State) -> State:
-    """The state with a complex in arrays of its own."""
+    """Copy the state, with a complex in separate arrays."""
     return state._replace(complex=Complex._make(array.copy() for array in state.complex))
 
 
 def grown(state: State, least: int = 64) -> State:
-    """The state with room for a quarter more cells, and for `least`."""
+    """The state with space for a quarter more cells, and at least `least`."""
     more = int(state.complex.n_cells[0]) // 4 + least
 
     def wider(array: NDArray) -> NDArray:
@@ -162,11 +161,11 @@ def grown(state: State, least: int = 64) -> State:
 
 
 def without_cells(state: State, is_gone: NDArray[np.bool_]) -> State:
-    """The state without some cells, (M,); their nodes stay, those on the new boundary marked as on a mask's surface."""
+    """The state without some cells, (M,); nodes stay, and those on the new boundary count as on the mask's surface."""
     mesh, n_cells = state.complex, len(is_gone)
     kept = np.flatnonzero(~is_gone)
     rows = np.append(kept, np.arange(n_cells, len(mesh.cells)))
-    number = np.full(n_cells + 1, -1, dtype=np.int64)  # its last row is that of -1, the outside
+    number = np.full(n_cells + 1, -1, dtype=np.int64)  # the last row stands for -1, the outside
     number[kept] = np.arange(len(kept))
     beyond = mesh.cells[:n_cells][is_gone]
     complex_ = mesh._replace(**{name: getattr(mesh, name)[rows] for name in CELL_ROWS}, n_cells=np.array([len(kept)]))
@@ -178,7 +177,7 @@ def without_cells(state: State, is_gone: NDArray[np.bool_]) -> State:
 
 @entry
 def fill_across(across: Ints2, cells: Ints2, n_cells: int, n_nodes: int) -> None:
-    """The cell beyond each facet, by counting sort over the facets' lowest nodes."""
+    """Fill in the cell beyond each facet, by counting sort over the facets' lowest nodes."""
     n = cells.shape[1]
     start = np.zeros(n_nodes + 1, dtype=np.int64)
     for c in range(n_cells):
@@ -218,7 +217,7 @@ def _lowest_node(cells: NDArray, cell: int, k: int) -> int:
 
 @helper
 def _is_one_facet(cells: NDArray, c: int, k: int, d: int, m: int) -> bool:
-    """Whether facet k of cell c has the same nodes as facet m of cell d."""
+    """True if facet k of cell c has the same nodes as facet m of cell d."""
     for s in range(cells.shape[1]):
         if s != k and (cells[c, s] == cells[d, m] or not has_node(cells, d, cells[c, s])):
             return False
@@ -236,7 +235,7 @@ def facet_of(across: NDArray, cell: int, other: int) -> int:
 
 @helper
 def corner_of(cells: NDArray, cell: int, node: int) -> int:
-    """Which corner of `cell` is `node`."""
+    """The corner of `cell` that is `node`."""
     k = 0
     while cells[cell, k] != node:
         k += 1
@@ -245,7 +244,7 @@ def corner_of(cells: NDArray, cell: int, node: int) -> int:
 
 @helper
 def has_node(cells: NDArray, cell: int, node: int) -> bool:
-    """Whether `node` is a corner of `cell`."""
+    """True if `node` is a corner of `cell`."""
     is_corner = False
     for k in range(cells.shape[1]):
         is_corner = is_corner or cells[cell, k] == node
@@ -254,7 +253,7 @@ def has_node(cells: NDArray, cell: int, node: int) -> bool:
 
 @helper
 def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, objective: Objective) -> None:
-    """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space, to out[p, q, :]."""
+    """Write the flux of the facet (a, b, c), or (a, b) if c < 0, times the sign of index space, to out[p, q, :]."""
     sampled_flux(out, p, q, ticks, a, b, c, objective.volume)
     if objective.hand < 0:
         for d in range(out.shape[2]):
@@ -279,8 +278,8 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
 def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> float:
     """Sum of squares around the values of one cell, over all channels, from its moment sums, a row of `sums`.
 
-    A cell's value is its mean; of the channels of labels, once cells have labels, what its own label has there: so
-    that what a cell of one label holds of another is wrong whatever cells it is divided into.
+    A cell's value is its mean; in the channels of labels, once cells have labels, it is its label's value, so that
+    voxels of other labels in a cell count as errors however the cell is divided.
     """
     count = sums[row, 0]
     if count <= 0.0:
@@ -298,7 +297,7 @@ def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> f
 
 @helper
 def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Objective) -> float:
-    """What a cell that holds voxels has for a channel: its mean, or what its label has; see `image_energy`."""
+    """Value of a cell with voxels in a channel: its mean, or its label's value; see `image_energy`."""
     column = 1 if channel == 0 else 2 + channel
     if channel < objective.n_means:
         return sums[cell, column] / sums[cell, 0]
@@ -307,25 +306,25 @@ def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Ob
 
 @helper
 def wrong_side(sums: NDArray, row: int, objective: Objective) -> float:
-    """Weighted voxels outside of the mask less those inside, in one cell: what changes is the mask's misfit."""
+    """Weighted voxels outside the mask minus those inside, in one cell; its changes are those of the mask's misfit."""
     return objective.surface * sums[row, sums.shape[1] - 1] if objective.surface > 0.0 else 0.0
 
 
 @helper
 def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> float:
-    """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for one that is flat or inverted.
+    """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for a flat or inverted cell.
 
-    eta = S / (12 (3 v)^(2/3)) in 3-D, S / (4 sqrt(3) v) in 2-D, S the sum of the squared edges and v the volume: 1 on
-    the regular cell, infinite on a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes on a sliver; with
-    p = 1 the energy is the paper's, and for p > 2.5 it grows without bound as a cell goes flat.
+    eta = S / (12 (3 v)^(2/3)) in 3-D and S / (4 sqrt(3) v) in 2-D, with S the sum of the squared edges and v the
+    volume: 1 for the regular cell, infinite for a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes for a
+    sliver. With p = 1 the energy is the paper's; for p > 2.5 it grows without bound as a cell becomes flat.
 
-    On a graded mesh v^(5/3) would leave the shape to the largest cells: one of twice the edge weighs 32 times as much.
-    Section 4 of the paper asks for a weight by the local mesh size there. With E_G,j over h^5, h^3 proportional to the
-    cell's own volume, all sizes cancel, and what is left is eta^p: the same for every cell of that shape, so that the
-    shape term has no wish for any size and E_D alone says where cells are small.
+    On a graded mesh v^(5/3) would give all weight to the largest cells: a cell with twice the edge weighs 32 times as
+    much. Section 4 of the paper suggests a weight by the local mesh size. With E_G,j over h^5, and h^3 proportional to
+    the cell's own volume, all sizes cancel and eta^p remains: the same for every cell of that shape, so that the shape
+    term favours no size and E_D alone determines where cells are small.
 
-    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT_FRACTION`,
-    so a cell that passes is positively oriented exactly.
+    Corners come from `load`, which subtracts in integers: the rounding error of the signed volume is far below
+    `FLAT_FRACTION`, so that a cell that passes is exactly positively oriented.
     """
     if n_corners == 3:
         u, v = difference(x, 1, 0), difference(x, 2, 0)
@@ -347,7 +346,7 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
 def determinant_and_squares(x: NDArray) -> tuple:
     """Six times the signed volume of the tetrahedron x (4, 3), and the sum of its squared edges."""
     u, v, w = difference(x, 1, 0), difference(x, 2, 0), difference(x, 3, 0)
-    # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
+    # The sum of squares over all pairs of four points is four times that over the points minus the square of their sum.
     s = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
     S = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     S = 4.0 * (S + w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -366,36 +365,36 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
     E_G = volume * S / 20.0
     if power == 1.0:
         return E_G
-    if power == 3.0:  # the default, without the cubic root of a square: eta^2 = S^2 / (144 (3 v)^(4/3))
+    if power == 3.0:  # the default, without the cube root of a square: eta^2 = S^2 / (144 (3 v)^(4/3))
         t = 1.0 / np.cbrt(3.0 * volume)
         t *= t
         return E_G * S * S * t * t * (1.0 / 144.0)
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 
 
-# Inlined, as `cell_energy` is: a pass of flips took 70 ms, not 96 (with `tet_energy`, too: that alone gains little).
+# Inlined like `cell_energy`: a pass of flips took 70 ms, not 96 (with `tet_energy`, too, which alone gains little).
 @inlined
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: Objective) -> None:
-    """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
+    """Write a node's position relative to the node `base`, mm, to a row of x; the subtraction is exact, in integers."""
     put_row(x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base))))
 
 
 @helper
 def place(ticks: NDArray, node: int, base: int, objective: Objective) -> tuple:
-    """What `load` writes."""
+    """A node's position relative to the node `base`, mm, as `load` writes it."""
     return times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
 
 
 @helper
 def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> None:
-    """A cell's corners relative to its first, in mm."""
+    """Write a cell's corners relative to its first, mm, to x."""
     for k in range(cells.shape[1]):
         load(x, k, ticks, cells[cell, k], cells[cell, 0], objective)
 
 
 @helper
 def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> float:
-    """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
+    """Shape energy of a cell of the complex; its corners are written to `x` (4, 3)."""
     load_cell(x, ticks, cells, cell, objective)
     return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
@@ -429,7 +428,7 @@ def signed_volume(x: Floats2, n_corners: int) -> float:
 
 @unit
 def worst_cosine(x: Floats2) -> float:
-    """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3): it grows with the angle; -1 if flat.
+    """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3), which grows with it; -1 if flat.
 
     Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
     """
@@ -445,15 +444,15 @@ def worst_cosine(x: Floats2) -> float:
 
 @helper
 def _face_normal(x: NDArray, k: int) -> tuple:
-    """A normal of the face opposite a corner of a tetrahedron, outwards."""
+    """An outward normal of the face opposite a corner of a tetrahedron."""
     a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
-    # (k+1, k+2, k+3) turns outwards for even k of a positive cell, inwards for odd.
+    # (k+1, k+2, k+3) faces outwards for even k of a positive cell, inwards for odd k.
     return scaled(-1.0 if k & 1 else 1.0, cross(difference(x, b, a), difference(x, c, a)))
 
 
 @entry
 def cosine_up_to_limit(x: Floats2, objective: Objective) -> float:
-    """`worst_cosine`, or just the limit for a tetrahedron that is far from it: most are, and this costs a tenth."""
+    """`worst_cosine`, or the limit for a tetrahedron far above it: most are, and this takes a tenth of the time."""
     determinant, S = determinant_and_squares(x)
     if determinant > 0.0 and S * S * S <= objective.safe * determinant * determinant:
         return objective.angle_limit
@@ -477,7 +476,7 @@ def tet_cosine(x: NDArray, state: State, a: int, b: int, c: int, d: int) -> floa
 
 @unit
 def _measure_cells(state: State, chunk: int) -> None:
-    """Each facet is measured once, by its lower cell."""
+    """Measure each facet once, from its lower cell."""
     first = chunk * CELLS_PER_CHUNK
     x, cells, across = np.empty((4, 3)), state.complex.cells, state.complex.across
     for cell in range(first, min(first + CELLS_PER_CHUNK, state.complex.n_cells[0])):
@@ -489,7 +488,7 @@ def _measure_cells(state: State, chunk: int) -> None:
 
 @helper
 def measure_facet(state: State, cell: int, k: int) -> None:
-    """Flux of facet k of a cell, as the ticks stand."""
+    """Measure the flux of facet k of a cell at the current ticks."""
     a, b, c = outward(state.complex.cells, cell, k)
     put_flux(state.complex.fluxes, cell, k, state.complex.ticks, a, b, c, state.objective)
 
@@ -510,17 +509,17 @@ def _sum_cells(state: State, chunk: int) -> None:
 
 @helper
 def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
-    """A cell's moment sums from its facets."""
+    """Compute a cell's moment sums from its facets."""
     for d in range(fluxes.shape[2]):
         total = 0.0
         for k in range(fluxes.shape[1]):
             total += fluxes[cell, k, d]
-        sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # no rounding left without voxels
+        sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # without voxels no rounding error remains
 
 
 @unit
 def settle(x: Floats2, state: State, cell: int) -> None:
-    """Shape energy and sums of a cell whose corners and fluxes are set; its corners' places are left in `x` (4, 3)."""
+    """Compute shape energy and sums of a cell with known corners and fluxes; write its corners to `x` (4, 3)."""
     mesh = state.complex
     mesh.E_shape[cell] = shape_of_cell(x, mesh.ticks, mesh.cells, cell, state.objective)
     sum_up(mesh.sums, mesh.fluxes, cell)
@@ -535,7 +534,7 @@ def cell_energy(state: State, cell: int) -> float:
 
 
 def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64]:
-    """Sum of squares around its values of each cell, (n_cells,); around its means with all channels as `n_means`."""
+    """Each cell's sum of squares around its values, (n_cells,), or around means if `n_means` is all channels."""
     n_cells, objective = int(state.complex.n_cells[0]), state.objective
     n_means = objective.n_means if n_means is None else n_means
     sums, labels = state.complex.sums[:n_cells], state.complex.labels[:n_cells]
@@ -549,20 +548,20 @@ def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64
 
 @helper
 def is_interface(complex_: Complex, cell: int, k: int) -> bool:
-    """Whether a facet lies between two labels."""
+    """True if a facet lies between two labels."""
     other = complex_.across[cell, k]
     return other >= 0 and complex_.labels[other] != complex_.labels[cell]
 
 
 @helper
 def pair_tension(objective: Objective, one: int, other: int) -> float:
-    """What a mm^(n-1) between two labels costs."""
+    """Energy per mm^(n-1) of interface between two labels."""
     return objective.tension * (objective.own_value[one] ** 2 + objective.own_value[other] ** 2)
 
 
 @helper
 def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
-    """Area of the facet (a, b, c), mm^2, or length of the segment (a, b) with c < 0, mm."""
+    """Area of the facet (a, b, c), mm^2, or length of the segment (a, b) if c < 0, mm."""
     u = place(ticks, b, a, objective)
     if c < 0:
         return np.sqrt(dot(u, u))
@@ -572,7 +571,7 @@ def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> 
 
 @entry
 def interface_energy(state: State) -> float:
-    """What all facets between labels cost together."""
+    """Total energy of all facets between labels."""
     mesh, total = state.complex, 0.0
     if state.objective.tension > 0.0:
         for cell in range(mesh.n_cells[0]):
@@ -595,16 +594,16 @@ def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
 
 
 class NodeStars(NamedTuple):
-    """The cells around each node, as compressed rows, and which of their facets are one and the same."""
+    """The cells around each node, as compressed rows, and the pairs of their facets that coincide."""
 
     start: Ints1  # (N+1,)
     cells: Ints1  # (C(n+1),)
-    corner: Ints1  # (C(n+1),) which corner of the cell is the node
+    corner: Ints1  # (C(n+1),) corner of the cell that is the node
     twin: Ints2  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
 
 
 def node_stars(state: State) -> NodeStars:
-    """The stars of a complex as it stands."""
+    """The current stars of a complex."""
     n_cells, n_corners = int(state.complex.n_cells[0]), state.complex.cells.shape[1]
     start = np.zeros(len(state.complex.ticks) + 1, dtype=np.int64)
     cells = np.empty(n_cells * n_corners, dtype=np.int64)
@@ -636,7 +635,7 @@ def _fill_stars(start: Ints1, star: Ints1, corner: Ints1, cells: Ints2, n_cells:
 
 
 class Twins(NamedTuple):
-    """What their twins are filled in from."""
+    """Data from which `twin` is filled in."""
 
     stars: NodeStars
     across: Ints2  # as of the complex

@@ -1,8 +1,8 @@
-"""What a run of `tetopt mesh` takes, seconds and memory, by sizes that are known before it.
+"""Predict time and memory of a run of `tetopt mesh` from sizes that are known in advance.
 
-Both are sums of terms, each a size times what one of it costs. The costs are fitted to measured runs of whole
-processes by `tests/benchmarks/fit_cost.py` (non-negative least squares of relative errors) and stand in `cost.toml`
-beside this module, with the machine, its speed, and the errors of runs that were left out of the fit.
+Both are sums of terms, each a size times its unit cost. `tests/benchmarks/fit_cost.py` fits the costs to measured runs
+of whole processes (non-negative least squares of relative errors). They are stored in `cost.toml` beside this module,
+with the machine, its speed, and the errors of runs excluded from the fit.
 """
 
 from __future__ import annotations
@@ -14,59 +14,59 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 MODEL_FILE = Path(__file__).with_name("cost.toml")
-CALIBRATION_VOXELS = 96  # along each axis of a cube, whose sums, 28 MB, are more than most caches have
-CALIBRATION_NODES = 9_000  # of a lattice, in which they are summed up again and again
-CALIBRATION_TURNS = 30  # of which the fastest counts: about a second in all
-KERNEL_BYTES = 2.5e8  # numba's compiler and all kernels, if they are not loaded yet, and buffers: 220 MB at most
-BOUND_MARGIN = 1.5  # on what sizes take: above the peaks of all runs that were measured
-# Of a part's box: its values as stored and as an image's, their sums, and a field of doubles besides. 32 were measured
-# of doubles, 28 of single precision, 20 of whole numbers of 16 bits (parts of 8 to 27 million voxels).
+CALIBRATION_VOXELS = 96  # along each axis of a cube, whose sums, 28 MB, exceed most caches
+CALIBRATION_NODES = 9_000  # of a lattice over which they are summed repeatedly
+CALIBRATION_TURNS = 30  # repetitions, of which the fastest counts: about a second in all
+KERNEL_BYTES = 2.5e8  # numba's compiler, all kernels if not yet loaded, and buffers: at most 220 MB
+BOUND_MARGIN = 1.5  # factor on predicted memory, so that it exceeds the peaks of all measured runs
+# Per voxel of a part's box: values as stored and as an image, their sums, and a field of doubles. Measured were 32 for
+# doubles, 28 for single precision, 20 for 16-bit integers (parts of 8 to 27 million voxels).
 PART_VOXEL_BYTES = 34.0
-NEXT_FRACTION = 0.3  # of what cells take: what an exchange or the end of a run takes besides
-CELLS_PER_NODE = {2: 2, 3: 6}  # of large meshes, by dimension
+NEXT_FRACTION = 0.3  # of the cells' memory: the additional memory of an exchange or the end of a run
+CELLS_PER_NODE = {2: 2, 3: 6}  # in large meshes, by dimension
 
 
 class RunSize(NamedTuple):
-    """What a run's cost depends on."""
+    """Sizes that determine the cost of a run."""
 
-    n_read: int  # voxels of all files that are read: contrasts, mask, labels
-    n_voxels: int  # that are meshed: those around a mask; divided ones, where labels are smooth and slices thick
-    n_nodes: int  # corners of cells; of order 2 there are more nodes
+    n_read: int  # voxels of all files read: contrasts, mask, labels
+    n_voxels: int  # voxels meshed: those around a mask; divided ones if labels are smooth and slices thick
+    n_nodes: int  # corners of cells; order 2 has more nodes
     iterations: int  # sweeps, at most
     n_channels: int = 1  # functions of the voxels: contrasts, channels of labels, one more for a mask
-    elongation: float = 1.0  # of voxels: how long they are along the last axis, to the mean across
+    elongation: float = 1.0  # length of a voxel along the last axis, over its mean length across
     ndim: int = 3
-    mode: str = "graded"  # as `tetopt.engine.meshing.Mode`
+    mode: str = "graded"  # a `tetopt.engine.meshing.Mode`
     order: int = 1
-    runs: int = 1  # optimisations in turn, towards an error or a number of nodes of order 2
-    has_region: bool = False  # a mask, or background left out
+    runs: int = 1  # successive optimisations, towards an error or a number of nodes of order 2
+    has_region: bool = False  # a mask, or excluded background
     has_memberships: bool = False  # labels with smooth interfaces
-    is_fractional: bool = False  # one image, not of whole numbers, whose sums take 64 bits
+    is_fractional: bool = False  # one image that is not of whole numbers, whose sums take 64 bits
     is_drawn: bool = False  # pictures
 
 
 class Prediction(NamedTuple):
-    """What a run is expected to take."""
+    """Predicted time and memory of a run."""
 
-    seconds: float  # of the clock, if nothing else uses the threads
-    cpu_seconds: float  # of all threads together
-    peak_bytes: float  # of memory, of the whole process
+    seconds: float  # wall-clock time, if nothing else uses the threads
+    cpu_seconds: float  # total over all threads
+    peak_bytes: float  # memory of the whole process
 
 
 class CostModel(NamedTuple):
-    """The fitted costs, and what they are worth; see `cost.toml`."""
+    """The fitted costs and their accuracy; see `cost.toml`."""
 
     seconds: dict[str, float]  # by term
     bytes: dict[str, float]  # by term
-    parallel_fraction: float  # of the sweeps' seconds, that threads divide among them
-    calibration_seconds: float  # of `calibration` on the machine of the fit
-    seconds_factor: float  # within which nine of ten runs left out of the fit lay
-    bytes_fraction: float  # likewise, of the measured
+    parallel_fraction: float  # fraction of the sweeps' seconds that threads share
+    calibration_seconds: float  # `calibration` on the machine of the fit
+    seconds_factor: float  # factor within which 90 % of runs excluded from the fit lay
+    bytes_fraction: float  # the same for memory, as a fraction of the measured value
 
 
 @cache
 def cost_model(path: Path = MODEL_FILE) -> CostModel:
-    """The costs in a file, by default those that this version comes with."""
+    """Load the costs from a file, by default those of this version."""
     table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     return CostModel(
         table["seconds"], table["bytes"], table["threads"]["parallel_fraction"],
@@ -76,16 +76,16 @@ def cost_model(path: Path = MODEL_FILE) -> CostModel:
 
 
 def predicted(size: RunSize, threads: int = 1, speed: float = 1.0) -> Prediction:
-    """Seconds and memory that a run of these sizes takes.
+    """Predict the seconds and memory of a run of these sizes.
 
     Parameters
     ----------
     size : RunSize
-        What is known of the run.
+        Sizes of the run.
     threads : int
-        That it computes on.
+        Number of threads.
     speed : float
-        Of the machine, in that on which the costs were fitted: `calibrated_speed`.
+        Speed of the machine relative to that of the fit: `calibrated_speed`.
     """
     model = cost_model()
     once, swept = once_terms(size), swept_terms(size)
@@ -98,13 +98,13 @@ def predicted(size: RunSize, threads: int = 1, speed: float = 1.0) -> Prediction
 
 
 def calibrated_speed() -> float:
-    """Speed of this machine, in that of the one on which the costs were fitted; it takes about a second."""
+    """Measure the speed of this machine relative to that of the fit, in about a second."""
     return cost_model().calibration_seconds / calibration()
 
 
 def calibration() -> float:
-    """Seconds of CPU time of a fixed piece of the engine's work, on one thread: voxels summed up and cells measured."""
-    import numba  # not before it is needed: who predicts for another machine loads no kernels
+    """CPU time in seconds of a fixed piece of the engine's work, on one thread: voxels summed and cells measured."""
+    import numba  # imported late: predictions for another machine need no kernels
     import numpy as np
 
     from tetopt.energy.sampling import cell_moments
@@ -112,12 +112,12 @@ def calibration() -> float:
     from tetopt.start.lattice import lattice_mesh
 
     voxels = np.arange(CALIBRATION_VOXELS**3, dtype=np.int64).reshape((CALIBRATION_VOXELS,) * 3)
-    image = Image((voxels * voxels % 1009).astype(np.float32))  # as irregular as an image is
+    image = Image((voxels * voxels % 1009).astype(np.float32))  # as irregular as an image
     mesh = lattice_mesh(image, nodes=CALIBRATION_NODES)
     threads, seconds = numba.get_num_threads(), []
     numba.set_num_threads(1)
     try:
-        cell_moments(image, mesh)  # its kernels are loaded then
+        cell_moments(image, mesh)  # loads its kernels
         for _ in range(CALIBRATION_TURNS):
             begin = time.process_time()
             cell_moments(image, mesh)
@@ -128,27 +128,27 @@ def calibration() -> float:
 
 
 def once_terms(size: RunSize) -> dict[str, float]:
-    """What takes time once a run, in units of its cost, by name."""
+    """Terms of the time spent once per run, in units of their costs, by name."""
     return {
         "process": 1.0,  # Python, libraries, kernels loaded
         "pictures": float(size.is_drawn),
-        "voxels_read": float(size.n_read),  # unpacked, aligned, summed up for their checksum
+        "voxels_read": float(size.n_read),  # unpacked, aligned, read for their checksum
         "membership_voxels": float(size.n_voxels * size.has_memberships),  # labels' levels
         "cells": float(_cells(size) * size.runs),  # made, measured, written
     }
 
 
 def swept_terms(size: RunSize) -> dict[str, float]:
-    """What takes time in each iteration, likewise."""
+    """Terms of the time spent in each iteration, in units of their costs, by name."""
     sweeps, cells = size.iterations * size.runs, _cells(size)
-    # Rows of voxels, along the last axis, that facets cross: as many facets as nodes, each as large as a cell's side.
+    # Rows of voxels along the last axis that facets cross: as many facets as nodes, each the size of a cell's side.
     fraction = 1.0 / size.ndim
     rows = size.n_nodes**fraction * (size.n_voxels * size.elongation) ** (1.0 - fraction)
     has_surface = size.has_region or size.has_memberships
     is_graded, is_paper = size.mode == "graded", size.mode == "paper"
     return {
         "graded_cells": float(sweeps * cells * is_graded),  # shapes, flips, exchanges
-        "graded_rows": float(sweeps * rows * is_graded),  # voxels sampled again, and again with each move
+        "graded_rows": float(sweeps * rows * is_graded),  # voxels resampled, also with each move
         "uniform_cells": float(sweeps * cells * (not is_graded and not is_paper)),  # no exchanges, small moves: no rows
         "paper_cells": float(sweeps * cells * is_paper),  # Delaunay each time
         "paper_rows": float(sweeps * rows * is_paper),  # numerical derivatives
@@ -158,7 +158,7 @@ def swept_terms(size: RunSize) -> dict[str, float]:
 
 
 def memory_terms(size: RunSize) -> dict[str, float]:
-    """What takes memory at the same time, likewise."""
+    """Terms of the memory in use at the same time, in units of their costs, by name."""
     return {
         "process": 1.0,
         "pictures": float(size.is_drawn),
@@ -172,16 +172,16 @@ def memory_terms(size: RunSize) -> dict[str, float]:
 
 
 def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -> float:
-    """What meshing takes at its peak besides what there is once the files are read: above all that was measured.
+    """Upper bound of the peak memory of meshing beyond that in use once files are read; above all measured runs.
 
     Parameters
     ----------
     n_voxels, n_channels : int
-        Of what is meshed.
+        Numbers of meshed voxels and channels.
     n_nodes : int
-        Of the mesh, of order 1; 0 for what the image takes alone.
+        Number of nodes of the mesh of order 1; 0 for the memory of the image alone.
     ndim : int
-        Of the image.
+        Dimension of the image.
     """
     size = RunSize(0, n_voxels, n_nodes, 0, n_channels, ndim=ndim)
     terms, costs = memory_terms(size), cost_model().bytes
@@ -190,19 +190,19 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
 
 
 def part_bytes(n_voxels: int, n_cells: int) -> float:
-    """What a part of a mesh takes at its peak besides what a process that runs parts has, above all that was measured.
+    """Upper bound of the peak memory of a part of a mesh beyond that of a process that runs parts.
 
     Parameters
     ----------
     n_voxels : int
-        Of the box around its cells.
+        Number of voxels of the box around its cells.
     n_cells : int
     """
     return PART_VOXEL_BYTES * n_voxels + BOUND_MARGIN * cost_model().bytes["cells"] * n_cells
 
 
 def next_bytes(n_nodes: int, ndim: int = 3) -> float:
-    """What the next steps of a run with so many nodes take besides what there is, at most."""
+    """Upper bound of the additional memory of the next steps of a run with `n_nodes` nodes."""
     return NEXT_FRACTION * (meshing_bytes(0, 0, n_nodes, ndim) - KERNEL_BYTES)
 
 

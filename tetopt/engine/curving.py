@@ -1,7 +1,7 @@
 """Mid-edge nodes of quadratic cells on smooth levels: on interfaces between labels, and on a mask's surface.
 
-The midpoint of an edge goes to where the levels that its ends lie on are met, nearly the shortest way, as
-`tetopt.engine.surface` brings nodes there. No cell around it may come near to folding.
+The midpoint of an edge moves nearly the shortest way onto the levels on which its ends lie, like nodes in
+`tetopt.engine.surface`. No cell around it may come near to folding.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-LEAST_JACOBIAN = 0.2  # of a curved cell's Jacobian determinant anywhere, over the straight cell's
-MOST_BENT = 0.25  # of an edge's length: a level further off its middle is another part of the surface
-ENDS_VOXELS = 0.5  # between levels at an edge's ends, twice the distance of an interface: further, cells do not follow
-LEAST_PART = 0.25  # of the way to the level: an edge that may not go so far stays straight
+LEAST_JACOBIAN = 0.2  # least ratio of a curved cell's Jacobian determinant to the straight cell's
+MOST_BENT = 0.25  # of an edge's length: a level farther from its middle belongs to another part of the surface
+ENDS_VOXELS = 0.5  # largest difference of levels at an edge's ends, twice an interface's distance, that cells follow
+LEAST_PART = 0.25  # least fraction of the way to the level; an edge that may not go so far stays straight
 
 
 class Curving(NamedTuple):
-    """What became of the edges on interfaces between labels and on a mask's surface; part of `MeshingResult`.
+    """Numbers of curved and straight edges on interfaces between labels and on a mask's surface.
 
     Parameters
     ----------
     n_edges : int
-        On interfaces or the mask's surface.
+        Edges on interfaces or the mask's surface.
     n_on_level : int
-        Those whose mid-edge node lies on the smooth level.
+        Edges whose mid-edge node lies on the smooth level.
     n_part_way : int
-        Those that go a half or a quarter of the way there, or else a cell would come near to folding.
+        Edges whose mid-edge node goes half or a quarter of the way, as a cell would otherwise come near to folding.
     n_straight : int
-        The others.
+        Other edges.
     farthest : float
-        From a straight edge's middle to its mid-edge node, mm.
+        Largest distance of a mid-edge node from the straight edge's middle, mm.
     least_jacobian : float
-        A lower bound of the Jacobian determinant anywhere in a cell, over that of the straight cell.
+        Lower bound of the Jacobian determinant anywhere in a cell, relative to the straight cell.
 
     Examples
     --------
@@ -62,34 +62,33 @@ class Curving(NamedTuple):
 
 
 class _Surfaces(NamedTuple):
-    """What the midpoints of edges are brought to."""
+    """Levels onto which the midpoints of edges move."""
 
     fields: list[NDArray[np.float32]]  # levels
-    pairs: NDArray[np.int64]  # (K, Q, 2) which level is to equal which other one, 0 if that is -1; -1, -1 for none
+    pairs: NDArray[np.int64]  # (K, Q, 2) pairs of levels to be equal; a second -1 stands for 0; -1, -1 for no pair
     edges: NDArray[np.int64]  # (K,) whose
 
 
 def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tuple[Mesh, Curving | None]:
-    """The mesh with midpoints, those of edges on interfaces and on the mask's surface on the smooth levels.
+    """Add midpoints to the mesh; those of edges on interfaces and on the mask's surface lie on the smooth levels.
 
-    An edge stays straight where its own ends are more than half a voxel off the mask's surface, or a quarter off an
-    interface, where the level is not found within a quarter of the edge's length, and where a cell's Jacobian
-    determinant could fall below a fifth of the straight cell's: all edges of such a cell go half of the way, a quarter,
-    or none of it.
+    An edge stays straight if its ends are more than half a voxel off the mask's surface, or a quarter off an interface;
+    if the level is not found within a quarter of the edge's length; or if a cell's Jacobian determinant could fall
+    below a fifth of the straight cell's: all edges of such a cell go half the way, a quarter, or none of it.
 
     Parameters
     ----------
     mesh : Mesh
         The result of a run.
     content : Content
-        What it was made of.
+        The content of the mesh.
     labels : (M,) int64, optional
         Label of each cell.
 
     Returns
     -------
     Mesh, Curving or None
-        None, and the mesh itself, of a content without a mask and without smooth labels.
+        The curved mesh and its numbers; the mesh itself and None for a content without mask and smooth labels.
     """
     has_labels = content.memberships is not None and labels is not None
     if not has_labels and content.region is None:
@@ -121,14 +120,14 @@ def _surfaces(
     cells: NDArray[np.int64], number: NDArray[np.int64], index: NDArray[np.float64], content: Content,
     labels: NDArray[np.int64] | None,
 ) -> _Surfaces:  # fmt: skip
-    """Which levels the edges of cells, numbered (M, 3 or 6), are on; labels (M,), nodes at `index`."""
+    """Levels on which the edges of cells, numbered (M, 3 or 6), lie, for labels (M,) and nodes at `index`."""
     fields: list[NDArray[np.float32]] = []
     n_edges = int(number.max()) + 1
     pairs = np.full((n_edges, MOST_MEETING, 2), -1)
     if labels is not None and (members := content.memberships) is not None:
         fields += list(members.levels)
         rank = np.searchsorted(members.labels, labels)
-        met = np.unique(number * len(members.labels) + rank[:, None])  # rising: by edge, then by label
+        met = np.unique(number * len(members.labels) + rank[:, None])  # ascending: by edge, then by label
         edge, label = np.divmod(met, len(members.labels))
         first = np.searchsorted(edge, edge)
         place = np.arange(len(edge)) - first
@@ -150,7 +149,7 @@ def _surfaces(
 
 
 def _ways(image: Image) -> NDArray[np.float64]:
-    """Maps (2^n, n, n) from the slope of a level, by index, to the shortest way up, for each set of axes held."""
+    """Maps (2^n, n, n) from the slope of a level, by index, to the shortest way up, for each set of fixed axes."""
     n = image.ndim
     ways = np.zeros((2**n, n, n))
     for number in range(2**n - 1):
@@ -161,7 +160,7 @@ def _ways(image: Image) -> NDArray[np.float64]:
 
 
 def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far the levels of each pair are apart at places (K, n), (K, Q), in voxels; 0 for none."""
+    """Difference of the levels of each pair at places (K, n), (K, Q), voxels; 0 for no pair."""
     values = np.zeros(surfaces.pairs.shape[:2])
     for number, field in enumerate(surfaces.fields):
         for side, sign in enumerate((1.0, -1.0)):
@@ -173,7 +172,7 @@ def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]
 def _brought(
     surfaces: _Surfaces, start: NDArray[np.float64], ways: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Places (K, n) brought from `start` to where their pairs of levels are equal, and which of them came there."""
+    """Places (K, n) moved from `start` to where their pairs of levels are equal, and a mask of those that arrive."""
     at = start.copy()
     tolerance = np.where((surfaces.pairs[..., 0] >= 0).sum(axis=1) == 1, ON_SURFACE_VOXELS, NEAR_CURVE_VOXELS)
     left = np.arange(len(at))
@@ -198,9 +197,9 @@ def _unfolded(
     mesh: Mesh, edges: NDArray[np.int64], number: NDArray[np.int64], ways: NDArray[np.float64],
     part: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:  # fmt: skip
-    """Midpoints (E, n) a part of each way off the straight ones, and the least bound of a cell's Jacobian determinant.
+    """Midpoints (E, n) moved a fraction of each way, and the least bound of a cell's Jacobian determinant.
 
-    Where that is too small, parts become less, in place.
+    Where that bound is too small, fractions are reduced, in place.
     """
     straight = mesh.points[edges].mean(axis=1)
     bounds, left = np.ones(len(mesh.cells)), np.flatnonzero((part[number] > 0.0).any(axis=1))

@@ -1,14 +1,13 @@
-"""Nodes put in and taken out where that lowers E: edges split at their middle, edges collapsed into one of their ends.
+"""Insert and remove nodes where that lowers E: split edges at their middle, or collapse them to one of their ends.
 
-What a split or a collapse is worth is measured with the same energy as every other move. Splits always lower E_D and
-collapses raise it, so it takes a number of nodes to weigh one against the other: nodes are exchanged, the cheapest
-collapses for the splits that are worth more, at most as many as are asked for. On a graded mesh (see
-`tetopt.engine.complex.shape_energy`) a node's cells cost the same shape energy wherever it is, so that what is
-exchanged is error of the image.
+The gain of a split or a collapse is measured with the same energy as every other move. Splits always lower E_D and
+collapses raise it, so a number of nodes is needed to balance them: nodes are exchanged, the cheapest collapses for
+splits with a larger gain, up to a requested number. On a graded mesh (see `tetopt.engine.complex.shape_energy`) the
+cells of a node have the same shape energy everywhere, so that exchanges trade only the error of the image.
 
-Each node looks at the edges to its neighbours and keeps its best split and its best collapse, all nodes at once; moves
-are then made one after the other, the most worth first, each only if no cell around it has changed since. A move works
-on a node's star, so one code serves triangles and tetrahedra.
+Each node evaluates the edges to its neighbours and keeps its best split and its best collapse, all nodes in parallel.
+Moves are then made one after the other, the largest gain first, each only if no cell around it has changed. A move
+works on a node's star, so that the same code serves triangles and tetrahedra.
 """
 
 from __future__ import annotations
@@ -69,23 +68,23 @@ from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 
-# Of a node's mean part of E: splits worth less are not looked for. The last one made in a round is worth 0.4 to 0.8.
+# Of a node's mean part of E: least gain of a split considered. The last one made in a round gains 0.4 to 0.8.
 LEAST_SPLIT_FRACTION = 0.2
-LEAST_EXCHANGE_FRACTION = 1e-3  # of a node's mean part of E: an exchange of two nodes that is worth less is not made
-# Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
+LEAST_EXCHANGE_FRACTION = 1e-3  # of a node's mean part of E: least gain of an exchange of two nodes
+# Of the noise's variance: the same; about the largest gain by chance among thousands of edges in noise.
 LEAST_OVER_NOISE = 20.0
-MIDDLE_SHIFT_FRACTION = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
-SURFACE_VOLUME_FRACTION = 0.1  # of the star's volume: what a collapse on a mask's surface may add or take
-ROUNDING_FRACTION = 1e-9  # of the star's volume: what a collapse elsewhere may, which is only rounding
-MAX_NEIGHBOURS = 128  # edges of a node that are looked at, at most
-# What the split of an edge that is too long for its target counts besides what E falls by, times the square of its
-# length over the target: E is about 1 to begin with, so that no other split is before it, and E's digits are kept.
+MIDDLE_SHIFT_FRACTION = 0.25  # of an edge on a mask's surface: the farthest that a node is put from its middle
+SURFACE_VOLUME_FRACTION = 0.1  # of the star's volume: the largest change by a collapse on a mask's surface
+ROUNDING_FRACTION = 1e-9  # of the star's volume: the same elsewhere, where it is only rounding
+MAX_NEIGHBOURS = 128  # most edges of a node that are evaluated
+# Bonus for splitting an edge that is too long for its target, times the square of its length over the target: E starts
+# at about 1, so that such splits come before all others, and E's digits are kept.
 TARGET_CREDIT = 1e4
-LEAST_LIFT_COSINE = 1e-4  # a move is made for a worst angle only if minus its cosine grows by more
+LEAST_LIFT_COSINE = 1e-4  # least growth of a worst angle's negative cosine for a move
 
 
 class Exchanged(NamedTuple):
-    """What `exchange` and `mend` return."""
+    """Result of `exchange` and `mend`."""
 
     state: State
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
@@ -95,30 +94,30 @@ class Exchanged(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What moves have to keep."""
+    """Limits that moves must respect."""
 
     shortest: float  # mm: no split makes a shorter edge
     longest: Floats1  # (N,) mm: no collapse makes a longer edge at a node
-    noise: float  # variance of the image's noise: what chance alone wins is not worth a node
-    target: Floats1  # (N,) mm: edges over sqrt 2 times it are split before all others
-    dearest: float = np.inf  # E may rise by so much in a collapse
-    least: float = -np.inf  # and has to fall by more in a split
+    noise: float  # variance of the image's noise: gains by chance are not worth a node
+    target: Floats1  # (N,) mm: edges longer than sqrt 2 times this are split first
+    dearest: float = np.inf  # largest rise of E in a collapse
+    least: float = -np.inf  # E must fall by more in a split
 
 
 class EdgeMoves(NamedTuple):
     """For each node the best split, or the best collapse, of one of its edges."""
 
-    may_move: Bools1  # (N,) nodes that are looked at
-    other: Ints1  # (N,) the edge's other end; -1 where there is none that is allowed
-    gain: Floats1  # (N,) by how much E falls; below 0 if it rises, -inf where there is none
+    may_move: Bools1  # (N,) nodes to evaluate
+    other: Ints1  # (N,) the edge's other end; -1 if no edge is allowed
+    gain: Floats1  # (N,) reduction of E; negative if it rises, -inf without an edge
 
 
 def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged:
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
-    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E, or splits an edge
-    that is too long for its target. One round doubles the nodes at most. The complex of `state` is out of date
-    afterwards.
+    Beyond the moves that the number requires, up to `most` nodes are exchanged if each exchange lowers E, or splits an
+    edge that is too long for its target. One round at most doubles the nodes. Afterwards the complex of `state` is out
+    of date.
     """
     n_before = len(state.complex.ticks)
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
@@ -126,14 +125,14 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     state = roomy(state, n_before, 16 * (max(more, 0) + most))
     E_G, squares = energies(state)
     E = state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
-    # Splits pay where the error is, collapses where it is not: half of the nodes are looked at for each, unless many
-    # nodes are to be put in, or taken out. It costs no E_D that could be measured, and saves half of the time.
+    # Splits pay where the error is large, collapses where it is small: half of the nodes are evaluated for each, unless
+    # many nodes must be inserted or removed. This raises E_D by no measurable amount, and saves half of the time.
     error = _star_errors(state, n_before)
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8) | too_long(state, limits.target)
     least = LEAST_SPLIT_FRACTION * E / n_before if more <= 0 else -np.inf
     splits = best_splits(state, stars, may_split, limits._replace(least=least))
-    is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split whatever it costs
+    is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split at any cost
     in_ = _best_first(splits)
     dearest = np.inf if more < 0 or is_sized else float(splits.gain[in_[: max(most // 4, 1)]].min(initial=np.inf))
     may_collapse = (error <= middle) | (more < -(n_before // 8)) | is_sized
@@ -146,7 +145,7 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
 
 
 def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Nodes with an edge that is over sqrt 2 times its target, (N,)."""
+    """Nodes with an edge longer than sqrt 2 times its target, (N,)."""
     is_one = np.zeros(len(target), dtype=np.bool_)
     if np.isfinite(target).any():
         _fill_too_long(is_one, state, target)
@@ -166,12 +165,12 @@ def _fill_too_long(is_one: Bools1, state: State, target: Floats1) -> None:
 
 @helper
 def squared_ratio(state: State, a: int, b: int, target: NDArray) -> float:
-    """The square of an edge's length over its target, the mean of those at its ends; 0 where there is none."""
+    """Square of an edge's length over its target (the mean of both ends' targets); 0 without a target."""
     return squared_length(state, a, b) / (0.25 * (target[a] + target[b]) ** 2)
 
 
 def _best_first(moves: EdgeMoves) -> NDArray[np.int64]:
-    """The nodes that have a move, the most worth first."""
+    """The nodes that have a move, the largest gain first."""
     order = np.lexsort((np.arange(len(moves.gain)), -moves.gain))
     return order[moves.gain[order] > -np.inf]
 
@@ -184,7 +183,7 @@ def _star_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
 
 
 def roomy(state: State, n_nodes: int, n_cells: int) -> State:
-    """The state with room for that many more nodes and cells; further rows of `ticks` are not nodes yet."""
+    """The state with space for more nodes and cells; the additional rows of `ticks` are not nodes yet."""
     if len(state.complex.cells) - state.complex.n_cells[0] < n_cells:
         state = grown(state, n_cells)
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
@@ -199,7 +198,7 @@ def compacted(
     state: State, is_dirty: NDArray[np.bool_] | None = None, n_before: int | None = None, n_split: int = 0,
     n_collapsed: int = 0,
 ) -> Exchanged:  # fmt: skip
-    """Nodes without cells left out, and the others numbered anew in their order."""
+    """Remove nodes without cells, and renumber the others in their order."""
     n_cells = int(state.complex.n_cells[0])
     is_dirty = np.zeros(n_cells, dtype=np.bool_) if is_dirty is None else is_dirty
     n_before = len(state.complex.ticks) if n_before is None else n_before
@@ -219,10 +218,11 @@ def make_exchanges(
     state: State, stars: NodeStars, splits: EdgeMoves, collapses: EdgeMoves, in_: Ints1, out: Ints1,
     quota: tuple[int, int, float], is_dirty: Bools1,
 ) -> tuple[int, int]:  # fmt: skip
-    """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are more nodes; then do both in pairs.
+    """Split edges of the nodes `in_` or collapse the nodes `out` up to the quota; then do both in pairs.
 
-    In their order, and each only if none of its cells has changed. The quota: how many more nodes; at most how many
-    pairs; and by how much each pair has to lower E at least. Returns how many were split and collapsed.
+    Moves are made in their order, each only if none of its cells has changed. The quota is the number of additional
+    nodes, the largest number of pairs, and the least reduction of E by each pair. Returns the numbers of splits and
+    collapses.
     """
     n_nodes = len(stars.start) - 1
     more, most, least = quota
@@ -237,7 +237,7 @@ def make_exchanges(
                 s += 1
             if s == len(in_):
                 break
-            _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner is to be elsewhere
+            _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner must be elsewhere
         if does_collapse:
             while c < len(out) and not _can_collapse(state, stars, out[c], collapses.other[out[c]], is_dirty):
                 c += 1
@@ -274,9 +274,9 @@ def _is_clean(stars: NodeStars, node: int, is_dirty: NDArray) -> bool:
 
 @unit
 def _can_collapse(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> bool:
-    """Whether nothing has changed around a; nor, between labels, around b and next to either.
+    """True if nothing has changed around a and, between labels, around b and next to either.
 
-    A cell that goes takes facets between labels from those beside it, too.
+    A removed cell also takes facets between labels from its neighbours.
     """
     if not _is_clean(stars, a, is_dirty):
         return False
@@ -294,16 +294,16 @@ def _can_collapse(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bool
 
 @helper
 def _can_split(state: State, stars: NodeStars, a: int, is_dirty: NDArray) -> bool:
-    """Whether the cells around a are as they were, and there is room for more."""
+    """True if the cells around a are unchanged and there is space for more."""
     size = stars.start[a + 1] - stars.start[a]
     return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(stars, a, is_dirty)
 
 
 @unit
 def _sides_of_edge(state: State, stars: NodeStars, a: int, b: int) -> int:
-    """The box's sides that an edge lies in, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
+    """The box's sides in which an edge lies, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
 
-    The boundary's facets at the edge decide, not its ends: they may lie in a side to which the edge is a crease.
+    The boundary's facets at the edge decide, not its ends, which may lie in a side that the edge does not.
     """
     cells, t, sides = state.complex.cells, state.complex.ticks, 0
     for r in range(stars.start[a], stars.start[a + 1]):
@@ -329,7 +329,7 @@ def _sides_of_edge(state: State, stars: NodeStars, a: int, b: int) -> int:
 def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
     """Put the node p at the middle of an edge, or on the surface beside it.
 
-    False if that is on a boundary that is to stay, or the surface is not reached.
+    Returns False if it lies on a fixed boundary, or the surface is not reached.
     """
     ticks, cells, is_frozen = state.complex.ticks, state.complex.cells, state.complex.is_frozen
     sides = _sides_of_edge(state, stars, a, b)
@@ -366,7 +366,7 @@ def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
 
 @helper
 def is_among(label: int, labels: NDArray) -> bool:
-    """Whether a label is one of several."""
+    """True if a label is one of several."""
     is_one = False
     for other in labels:
         is_one = is_one or other == label
@@ -375,7 +375,7 @@ def is_among(label: int, labels: NDArray) -> bool:
 
 @unit
 def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: int) -> int:
-    """The labels of the cells around an edge, to `meeting` (4,) if they are 2 to 4, else -1; how many there are."""
+    """Write the labels around an edge to `meeting` (4,) if there are 2 to 4, else -1; return their number."""
     count = 0
     for m in range(MOST_MEETING):
         meeting[m] = -1
@@ -394,9 +394,9 @@ def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: in
 
 
 def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
-    """For each bad cell the collapse or split of one of its edges that leaves the best worst angle, if any is better.
+    """For each bad cell make the collapse or split of an edge that leaves the best worst angle, if it improves.
 
-    Judged by minus the cosine of the smallest dihedral angle, counted up to `target`. Cells of `bad` come worst first.
+    The measure is minus the cosine of the smallest dihedral angle, up to `target`. Cells of `bad` come worst first.
     """
     n_before = len(state.complex.ticks)
     stars = node_stars(state)
@@ -443,7 +443,7 @@ def _mend(state: State, stars: NodeStars, bad: Ints1, target: float, is_dirty: B
 
 @helper
 def _lift_by_collapse(x: NDArray, state: State, stars: NodeStars, a: int, b: int, target: float) -> float:
-    """By how much the worst cosine around a grows if a is joined to b."""
+    """Growth of the worst cosine around a if a is joined to b."""
     cells, t = state.complex.cells, state.complex.ticks
     if not may_join(state, a, b):
         return -1.0
@@ -463,7 +463,7 @@ def _lift_by_collapse(x: NDArray, state: State, stars: NodeStars, a: int, b: int
 
 @helper
 def _lift_by_split(x: NDArray, state: State, stars: NodeStars, a: int, b: int, p: int, target: float) -> float:
-    """By how much the worst cosine around the edge (a, b) grows if it is split at p."""
+    """Growth of the worst cosine around the edge (a, b) if it is split at p."""
     old, new = target, target
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
@@ -480,9 +480,9 @@ def _lift_by_split(x: NDArray, state: State, stars: NodeStars, a: int, b: int, p
 
 
 def best_splits(state: State, stars: NodeStars, may_split: NDArray[np.bool_], limits: Limits) -> EdgeMoves:
-    """The best split of an edge of each node that may be, above the angle limit, without an edge that is too short.
+    """The best allowed split of an edge of each node, above the angle limit and without too short edges.
 
-    An edge of two nodes that may counts for the lower one. Rows N to 2 N of `ticks` and `is_frozen` are written to.
+    An edge between two allowed nodes belongs to the lower one. Rows N to 2 N of `ticks` and `is_frozen` are written.
     """
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
@@ -492,7 +492,7 @@ def best_splits(state: State, stars: NodeStars, may_split: NDArray[np.bool_], li
 
 
 class Splits(NamedTuple):
-    """What `best_splits` fills."""
+    """Inputs and outputs of `best_splits`."""
 
     moves: EdgeMoves
     state: State
@@ -518,7 +518,7 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
             ratio = squared_ratio(state, a, b, limits.target)
             bound[number] = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
             bound[number] += np.inf if state.objective.surface > 0.0 else _energy_of_edge(state, stars, a, b)
-    for _ in range(count):  # no edge is worth more than what its cells have, so the dearest come first
+    for _ in range(count):  # no edge gains more than its cells' energy, so the most expensive come first
         number = int(np.argmax(bound[:count]))
         if not bound[number] > best:
             break
@@ -534,7 +534,7 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
 
 @helper
 def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
-    """What the cells around the edge (a, b) have of E."""
+    """Energy of the cells around the edge (a, b)."""
     energy = 0.0
     for r in range(stars.start[a], stars.start[a + 1]):
         if has_node(state.complex.cells, stars.cells[r], b):
@@ -544,7 +544,7 @@ def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
 
 @helper
 def _is_long(state: State, stars: NodeStars, a: int, b: int, p: int, shortest: float) -> bool:
-    """Whether no edge from p to the other corners of the cells around the edge (a, b) is shorter than that."""
+    """True if no edge from p to the other corners of the cells around the edge (a, b) is shorter than the limit."""
     cells = state.complex.cells
     if shortest <= 0.0:
         return True
@@ -559,7 +559,7 @@ def _is_long(state: State, stars: NodeStars, a: int, b: int, p: int, shortest: f
 
 @unit
 def _neighbours(near: Ints1, cells: Ints2, stars: NodeStars, node: int) -> int:
-    """The nodes that share a cell with `node`, to `near`, as many as it takes; how many."""
+    """Write the nodes that share a cell with `node` to `near`, as many as fit; return their number."""
     count = 0
     for r in range(stars.start[node], stars.start[node + 1]):
         for k in range(cells.shape[1]):
@@ -575,7 +575,7 @@ def _neighbours(near: Ints1, cells: Ints2, stars: NodeStars, node: int) -> int:
 
 @unit
 def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p: int, least_gain: float) -> float:
-    """How much E falls if the edge (a, b) is split at p; -inf if it cannot be, or by less than `least_gain`."""
+    """Reduction of E by splitting the edge (a, b) at p; -inf if impossible or less than `least_gain`."""
     cells, fluxes, objective = state.complex.cells, state.complex.fluxes, state.objective
     n = cells.shape[1]
     old, shape = 0.0, 0.0
@@ -601,7 +601,7 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
     if objective.image == 0.0:
         return old - shape
     new, misfit, D = shape, 0.0, state.complex.sums.shape[1]
-    # Unless p was brought to a surface, the two halves of a facet of the edge are all of it: one of them is measured.
+    # Unless p was moved to a surface, the two halves of a facet of the edge make up all of it: measure one of them.
     is_beside = state.complex.is_frozen[p, 3] or state.complex.meeting[p, 1] >= 0
     flux, sums = np.empty((1, 1, D)), np.empty((2, D))
     for r in range(stars.start[a], stars.start[a + 1]):
@@ -626,7 +626,7 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
                 new += objective.image * image_energy(sums, half, state.complex.labels[cell], objective)
                 misfit += wrong_side(sums, half, objective)
             misfit -= wrong_side(state.complex.sums, cell, objective)
-            if old - new <= least_gain and objective.surface == 0.0:  # else the misfit may fall yet
+            if old - new <= least_gain and objective.surface == 0.0:  # otherwise the misfit may still fall
                 return -np.inf
     worth = old - new - misfit
     return worth if worth > least_gain else -np.inf
@@ -634,7 +634,7 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
 
 @helper
 def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
-    """By how much a cell's facets between labels cost more if the edge (a, b) is split at p: half of it."""
+    """Half of the rise of the energy of a cell's facets between labels if the edge (a, b) is split at p."""
     mesh, objective, rise = state.complex, state.objective, 0.0
     for k in range(mesh.cells.shape[1]):
         if mesh.cells[cell, k] in (a, b) or not is_interface(mesh, cell, k):
@@ -651,7 +651,7 @@ def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
 
 @unit
 def _shape_with(x: Floats2, state: State, cell: int, node: int, p: int) -> float:
-    """Shape energy of a cell with p in the place of its corner `node`; the corners are left in x."""
+    """Shape energy of a cell with p in place of its corner `node`; the corners are written to x."""
     cells, objective = state.complex.cells, state.objective
     k = corner_of(cells, cell, node)
     base = cells[cell, 0] if k > 0 else p
@@ -662,7 +662,7 @@ def _shape_with(x: Floats2, state: State, cell: int, node: int, p: int) -> float
 
 @helper
 def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p: int) -> None:
-    """Flux of facet k of a cell with p in the place of `node`, outwards, to flux[0, 0, :]."""
+    """Write the outward flux of facet k of a cell with p in place of `node` to flux[0, 0, :]."""
     a, b, c = outward(state.complex.cells, cell, k)
     a, b, c = p if a == node else a, p if b == node else b, p if c == node and c >= 0 else c
     put_flux(flux, 0, 0, state.complex.ticks, a, b, c, state.objective)
@@ -670,7 +670,7 @@ def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p:
 
 @unit
 def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty: Bools1) -> None:
-    """Each cell of the edge (a, b) becomes two: it keeps a, with p for b; a new one has b, with p for a."""
+    """Split each cell of the edge (a, b): it keeps a, with p for b; a new one has b, with p for a."""
     cells, across, fluxes = state.complex.cells, state.complex.across, state.complex.fluxes
     n, first, last = cells.shape[1], stars.start[a], stars.start[a + 1]
     x, new = np.empty((4, 3)), np.full(last - first, -1, dtype=np.int64)
@@ -698,7 +698,7 @@ def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty:
                 for s in range(first, last):
                     if stars.cells[s] == across[cell, k]:
                         across[other, k] = new[s - first]
-    for r in range(first, last):  # only now: the old corners were needed to find the new neighbours
+    for r in range(first, last):  # only now, as the search for new neighbours needed the old corners
         cell, other = stars.cells[r], new[r - first]
         if other < 0:
             continue
@@ -719,7 +719,7 @@ def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty:
 def best_collapses(
     state: State, stars: NodeStars, groups: Blocks, may_collapse: NDArray[np.bool_], limits: Limits
 ) -> EdgeMoves:
-    """The neighbour to which each node that may is best joined, so that no flat cell is left."""
+    """The neighbour to which each allowed node is best joined, so that no flat cell remains."""
     n_nodes = len(may_collapse)
     moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     laid_out = packed(state), packed(stars), packed(groups)
@@ -730,7 +730,7 @@ def best_collapses(
 
 
 class Collapses(NamedTuple):
-    """What `best_collapses` fills: the nodes of the groups of one colour."""
+    """Inputs and outputs of `best_collapses`, for the groups of one colour."""
 
     moves: EdgeMoves
     state: State
@@ -750,7 +750,7 @@ def _fill_collapses(work: Collapses, number: int) -> None:
 
 @unit
 def _best_collapse(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits: Limits) -> None:
-    """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
+    """The neighbour to which `a` is best joined; `a` moves there and back, unseen by cells of other groups."""
     cells, t, is_frozen, objective = state.complex.cells, state.complex.ticks, state.complex.is_frozen, state.objective
     if is_frozen[a, 0] and is_frozen[a, 1] and is_frozen[a, 2]:
         return
@@ -796,7 +796,7 @@ def squared_length(state: State, a: int, b: int) -> float:
 
 @unit
 def _is_short(state: State, near: Ints1, count: int, a: int, b: int, longest: Floats1) -> bool:
-    """Whether no edge from b to a neighbour of a is longer than the bound at its ends, or than the longest was."""
+    """True if no edge from b to a neighbour of a exceeds the bound at its ends, or the longest edge before."""
     old = 0.0
     for m in range(count):
         old = max(old, squared_length(state, a, near[m]))
@@ -809,9 +809,9 @@ def _is_short(state: State, near: Ints1, count: int, a: int, b: int, longest: Fl
 
 @helper
 def may_join(state: State, a: int, b: int) -> bool:
-    """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on its surfaces.
+    """True if a may move to b: it must stay in its sides of the box and on its surfaces.
 
-    The star would lose volume otherwise (`_keeps_size`), which costs more to find out.
+    Otherwise the star would lose volume (`_keeps_size`), which is more expensive to check.
     """
     ticks, is_frozen, meeting = state.complex.ticks, state.complex.is_frozen, state.complex.meeting
     may = not is_frozen[a, 3] or is_frozen[b, 3]
@@ -824,7 +824,7 @@ def may_join(state: State, a: int, b: int) -> bool:
 
 @unit
 def _keeps_domain(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float) -> bool:
-    """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the star's volume."""
+    """True if the mesh still covers its domain with a at b; `size` is n! times the star's volume."""
     if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, stars, a, b):
         return False
     if not state.complex.is_frozen[a, 3]:
@@ -838,11 +838,12 @@ def _keeps_domain(x: Floats2, state: State, stars: NodeStars, a: int, b: int, si
 
 @unit
 def _stays_between_labels(state: State, stars: NodeStars, a: int, b: int) -> bool:
-    """Whether a node between labels may be joined to b so that all labels keep their topology.
+    """True if a node between labels may be joined to b so that all labels keep their topology.
 
-    All labels that meet at it do so along the whole edge, which therefore lies on the same surface or curve; what holds
-    for the boundary holds for the facets between labels (`_is_linked`), and a curve of three edges is kept. No cell
-    that goes may have such facets opposite both ends: these would be laid on one another, and a label's last cell go.
+    All labels that meet at it must do so along the whole edge, which therefore lies on the same surface or curve.
+    Facets between labels must fulfil the same condition as the boundary (`_is_linked`), and a curve of three edges is
+    kept. No removed cell may have such facets opposite both ends: they would coincide, and a label's last cell might
+    vanish.
     """
     cells, labels = state.complex.cells, state.complex.labels
     meeting, other = np.empty(MOST_MEETING, dtype=np.int64), np.empty(MOST_MEETING, dtype=np.int64)
@@ -874,17 +875,17 @@ def _stays_between_labels(state: State, stars: NodeStars, a: int, b: int) -> boo
 
 @helper
 def _is_side(state: State, cell: int, node: int) -> bool:
-    """Whether a cell's facet opposite a node is on the boundary, or between labels."""
+    """True if a cell's facet opposite a node is on the boundary or between labels."""
     k = corner_of(state.complex.cells, cell, node)
     return state.complex.across[cell, k] < 0 or is_interface(state.complex, cell, k)
 
 
 @unit
 def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
-    """Whether a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
+    """True if a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
 
-    It has to lie on the boundary, and a node next to both of its ends must be so by a cell with both, on the boundary
-    by a facet with both.
+    It must lie on the boundary, and any common neighbour of its ends must share a cell with both or, on the boundary,
+    a facet.
     """
     cells = state.complex.cells
     near, n = np.empty(MAX_NEIGHBOURS, dtype=np.int64), cells.shape[1]
@@ -908,7 +909,7 @@ def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
 
 @helper
 def _is_outer(state: State, stars: NodeStars, a: int, b: int, c: int) -> bool:
-    """Whether a facet of the boundary, or between labels, has the nodes a and b, and c unless that is -1."""
+    """True if a facet of the boundary or between labels has the nodes a and b, and c unless that is -1."""
     cells = state.complex.cells
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
@@ -922,10 +923,9 @@ def _is_outer(state: State, stars: NodeStars, a: int, b: int, c: int) -> bool:
 
 @unit
 def _keeps_size(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float, fraction: float) -> bool:
-    """Whether the cells around a, moved to b, fill what they filled, but for a fraction: n! times their volume is
-    `size`.
+    """True if the cells around a, moved to b, keep their volume up to a fraction; `size` is n! times the volume.
 
-    All cells positive, they fan out from b over the star's hull; so this holds unless the domain itself is not convex
+    If all cells are positive, they fan out from b over the star's hull, so this holds unless the domain is not convex
     there.
     """
     cells = state.complex.cells
@@ -939,13 +939,13 @@ def _keeps_size(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size
 
 @unit
 def collapse_edge(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> None:
-    """Node a becomes b: cells with both go, and the others around a have b instead."""
+    """Replace node a by b: cells with both are removed, and the other cells around a get b instead."""
     cells, across, x = state.complex.cells, state.complex.across, np.empty((4, 3))
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
         is_dirty[cell] = True
         if has_node(cells, cell, b):
-            # What lay beyond its facets opposite a and b are neighbours now.
+            # The cells beyond its facets opposite a and b become neighbours.
             of_b, of_a = across[cell, corner_of(cells, cell, a)], across[cell, corner_of(cells, cell, b)]
             if of_a >= 0:
                 across[of_a, facet_of(across, of_a, cell)] = of_b

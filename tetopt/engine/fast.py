@@ -1,11 +1,11 @@
-"""The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, above a minimum angle.
+"""The fast engine: minimise the paper's energy by analytic gradients and energy-driven flips, above a minimum angle.
 
-Each iteration moves the nodes that can hope to lower their stars' energies (`smooth`) and then exchanges cells wherever
-that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle below the
-minimum, and a lattice starts far above it, so E falls from first to last, unless nodes are brought between labels.
-Cells of other initial meshes that are below it are mended at the end (`repair`), if nothing else has lifted them.
-Keeping it all along costs as much E_D as lifting the worst cells once E has settled (0.3587 of the initial one against
-0.3560: MNI152 T1, 4,864 nodes, k_D = 0.5), and E need not rise for it.
+Each iteration moves the nodes with an expected gain (`smooth`) and then exchanges cells wherever that lowers E
+(`flips`), which replaces Delaunay re-tessellation. No move leaves a dihedral angle below the minimum, and a lattice
+starts far above it, so E falls throughout, unless nodes are moved onto interfaces. Cells of other initial meshes below
+the minimum are repaired at the end (`repair`), if nothing else has lifted them. Keeping the minimum throughout costs as
+much E_D as lifting the worst cells once E has settled (0.3587 of the initial value against 0.3560: MNI152 T1, 4,864
+nodes, k_D = 0.5), and E need not rise for it.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.kernels import link, roots
 
-FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
-HOPE_FRACTION = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved
-EARLY_HOPE_FRACTION = 0.05  # likewise, as long as nodes are exchanged: cells change around them anyway
-EXCHANGING_FRACTION = 0.7  # of the iterations: the first ones, in which nodes are exchanged
-EXCHANGED_FRACTION = 0.1  # of the requested nodes: the most that are exchanged at once
-EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
-LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
-LABELLED_EVERY = 2  # iterations: again from there on, before exchanges
-LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
-# degrees: cells may be as flat, if `min_dihedral` is no lower, until nodes are between labels
+FLIP_EDGES = 0.05  # of an edge: nodes that moved less need no new flips
+HOPE_FRACTION = 0.003  # of E over the number of nodes: least expected gain of a move
+EARLY_HOPE_FRACTION = 0.05  # the same while nodes are exchanged, as cells around them change anyway
+EXCHANGING_FRACTION = 0.7  # of the iterations: the first ones, which exchange nodes
+EXCHANGED_FRACTION = 0.1  # of the requested nodes: most that are exchanged at once
+EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight, in an exchange; see `Run.exchange`
+LABELLED_AT = 3  # iteration from which cells have labels: exchanges have resolved thin parts, but not yet folds
+LABELLED_EVERY = 2  # iterations: labels are reassigned at this interval, before exchanges
+LEAST_EDGE_VOXELS = 1.0  # shortest edge that an exchange makes with labels, in addition to the limits on sizes
+# degrees: smallest allowed angle, if `min_dihedral` is no lower, until nodes lie on interfaces
 ATTRACTED_MIN_DIHEDRAL = 4.0
-# As many cells on a mask's boundary may be taken out where nothing lifts them: a fraction of all cells, or this number.
+# Most cells on a mask's boundary that may be removed if nothing lifts them: a fraction of all cells, or this number.
 FLAT_FRACTION, FLAT_CELLS = 0.005, 10
-MEND_ROUNDS = 3  # of lifting and taking out, at the end
+MEND_ROUNDS = 3  # of lifting and removing cells, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
@@ -88,70 +88,69 @@ def optimize(
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> MeshingResult:
-    """Move the nodes of a mesh, and connect them anew, to lower E.
+    """Move and reconnect the nodes of a mesh to lower E.
 
-    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial mesh.
 
     Parameters
     ----------
     image : Image or Content
-        The intensities h; or several channels, over which E_D is summed, and a mask (`tetopt.content`).
+        The intensities h, or a content with several channels, over which E_D is summed, and a mask (`tetopt.content`).
     mesh : Mesh
-        The initial mesh, which also normalises the two energies: any conforming mesh.
+        The initial mesh, any conforming mesh; it also normalises the two energies.
     k_D : float
         Weight of the image, 0 <= k_D < 1.
     iterations : int
-        Sweeps over all nodes, at most.
+        Maximum number of sweeps over all nodes.
     shape_power : float
-        p >= 1: each cell's E_G is weighted by eta^(p - 1), eta >= 1 the cell's mean-edge shape measure (see
-        `tetopt.engine.complex.shape_energy`). 1 is the paper's energy, which does not see slivers; above 2.5 it grows
-        without bound as a cell goes flat.
+        p >= 1: each cell's E_G is weighted by eta^(p - 1), where eta >= 1 is the cell's mean-edge shape measure (see
+        `tetopt.engine.complex.shape_energy`). 1 is the paper's energy, which is blind to slivers; above 2.5 it grows
+        without bound as a cell becomes flat.
     min_dihedral : float
-        The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no bound) to below 70. How many
-        cells are below it is for the caller to count (`tetopt.quality`); meshes of triangles have no such bound.
+        Smallest dihedral angle of a tetrahedron at the end, degrees, from 0 (no bound) to below 70. The caller must
+        count cells below it (`tetopt.quality`). Meshes of triangles have no such bound.
     boundary : {"slide", "fixed"}
-        Boundary nodes move within the box's faces and edges, those not on the box are fixed or, with a mask, whose
-        surface they are taken to lie on, slide on that; or the boundary stays as it is, node for node and facet for
-        facet, to the last bit.
+        "slide": boundary nodes move within the box's faces and edges; others are fixed or, with a mask, assumed to lie
+        on its surface and slide on it. "fixed": the boundary's nodes and facets stay unchanged to the last bit.
     nodes : int, optional
-        Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree_mesh`. Every
-        cell's shape then counts the same, whatever its size (see `tetopt.engine.complex.shape_energy`), and nodes
-        are exchanged in the first iterations, if k_D > 0 or `sizes` have a target. An exchange doubles them at most, so
-        that few iterations, or a number far from that of `mesh`, may miss it; count them. By default the nodes of
-        `mesh` are kept, and the shape energy is that of Eq. (1).
+        Insert nodes where they lower E most, towards this number, on a graded mesh such as `octree_mesh`. Every cell's
+        shape then has the same weight, whatever its size (see `tetopt.engine.complex.shape_energy`), and nodes are
+        exchanged in the first iterations if k_D > 0 or `sizes` has a target. An exchange at most doubles the nodes, so
+        few iterations may miss a number far from that of `mesh`. By default the nodes of `mesh` are kept, and the shape
+        energy is that of Eq. (1).
     sizes : Sizes, optional
         Targets and limits for the edges that exchanges make, with `nodes`.
     tolerance : float
-        Converged when E falls by less, relatively, in an iteration.
+        The run has converged if E falls by less, relatively, in an iteration.
     max_seconds : float, optional
-        Stop at the next colour of nodes after this time; the mesh is valid. Cells are lifted above the minimum dihedral
-        angle for a tenth of the run's time more, or half a second; flips of an iteration and labels take more.
+        Stop at the next colour of nodes after this time; the mesh is valid. Lifting cells above the minimum dihedral
+        angle may take another tenth of the run's time, or half a second; the iteration's flips and labels take more.
     callback : callable, optional
-        Called with each `IterationRecord`; without one a notebook shows a bar. Its E_G is the weighted one, its
-        `is_retessellated` whether cells were exchanged.
+        Called with each `IterationRecord`, with the weighted E_G and with `is_retessellated` True if cells were
+        exchanged. Without a callback, a notebook shows a progress bar.
     stop : callable, optional
-        Asked between colours of nodes; True ends the run there.
+        Called between colours of nodes; True ends the run.
 
     Returns
     -------
     MeshingResult
-        Mesh, history, why it ended, and in `violated` which requirements it does not meet
-        (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells, a mask or labels that
-        cells are too large for. The mesh covers the same domain, every cell is positively oriented. E never rises from
-        one record to the next, unless cells had to be lifted above the minimum dihedral angle, for which nodes may be
-        put in or taken out, or nodes were exchanged, or brought between labels; it is another E once cells have labels.
-        The same bits on any number of threads.
+        Mesh, history, reason for the end, and in `violated` the requirements that the mesh does not meet
+        (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells, a mask or labels for
+        which cells are too large. The mesh covers the same domain, and every cell is positively oriented. E never rises
+        between records, unless cells had to be lifted above the minimum dihedral angle (which may insert or remove
+        nodes), or nodes were exchanged or moved onto interfaces; once cells have labels, E is defined differently.
+        Results are the same to the last bit on any number of threads.
 
     Raises
     ------
     InputError
-        An option out of range; a mesh that the sampling cannot take (see `tetopt.cell_moments`), that is folded or
-        has a facet in more than two cells, or a cell too flat to have a shape energy; or energies that overflow.
+        An option out of range; a mesh that is invalid for sampling (see `tetopt.cell_moments`), is folded, has a facet
+        in more than two cells, or a cell too flat for a shape energy; or energies that overflow.
 
     See Also
     --------
-    mesh_image : The front door, which makes the initial mesh, too.
-    optimize_paper : The paper's own scheme.
+    mesh_image : Make the initial mesh and optimise it.
+    optimize_paper : Use the paper's scheme.
 
     Examples
     --------
@@ -170,7 +169,7 @@ def optimize(
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
     run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
     min_dihedral = min_dihedral if run.n == 3 else 0.0
-    # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
+    # Iterations that may exchange nodes: shape alone does not determine where to add nodes.
     n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(
         1, iterations, iterations, n_early, min_dihedral, tolerance, nodes, sizes, carves=boundary != "fixed"
@@ -186,17 +185,17 @@ def optimize(
 
 
 class Course(NamedTuple):
-    """The iterations that a run does: all of them, or those of one round on a part of a mesh."""
+    """The iterations of a run: all of them, or those of one round on a part of a mesh."""
 
     first: int
     last: int
     iterations: int  # in all
-    n_early: int  # the first of them, in which nodes are exchanged
+    n_early: int  # the first ones, which exchange nodes
     min_dihedral: float  # degrees
     tolerance: float  # as of `optimize`
     nodes: int | None  # as of `optimize`
     sizes: Sizes
-    carves: bool = False  # whether cells at pinches of a mask's boundary are taken out in the last iteration
+    carves: bool = False  # True if the last iteration removes cells at pinches of a mask's boundary
 
 
 def followed(
@@ -206,7 +205,7 @@ def followed(
     begin: float,
     callback: Callable[[IterationRecord], None] | None,
 ) -> tuple[list[IterationRecord], str]:
-    """Do the iterations of a course; the records, and why it ended: "iterations", "converged" or "over"."""
+    """Do the iterations of a course; return the records and "iterations", "converged" or "over"."""
     history: list[IterationRecord] = []
     min_dihedral, nodes = course.min_dihedral, course.nodes
 
@@ -232,17 +231,17 @@ def followed(
         # 1. Move the nodes.
         is_early = nodes is not None and iteration <= course.n_early
         is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION, stars)
-        # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
+        # 2. Exchange cells: if nodes are exchanged next, only at first, as cells around them change anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
-        is_new = is_labelled or (has_labels and not run.has_labels)  # E is another one: nothing has settled yet
+        is_new = is_labelled or (has_labels and not run.has_labels)  # E is defined differently: nothing has settled yet
         fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
-        # 3. Exchange nodes: in every other one of the first iterations.
+        # 3. Exchange nodes: in every second of the first iterations.
         if nodes is not None and does_exchange:
             n_changes += run.exchange_towards(nodes, course.sizes)
-        # 4. Lift flat cells and mend what is not a manifold: in the last iteration. Parts do so in every
-        # round, as in the next one what is under it may have nodes that stay.
+        # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts do so in
+        # every round, as nodes of flat cells may be fixed in the next one.
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
         n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
@@ -256,9 +255,9 @@ def followed(
 
 
 def gives_labels(iteration: int, course: Course) -> bool:
-    """Whether cells get labels from the voxels: first in `LABELLED_AT`, and again as nodes are exchanged.
+    """True if cells get labels from the voxels: first in `LABELLED_AT`, and again while nodes are exchanged.
 
-    In between labels keep their topology. Given once, holes of a sheet would stay that cells were too large for.
+    In between labels keep their topology. Labels assigned only once would keep holes of sheets thinner than the cells.
     """
     first = min(LABELLED_AT, course.iterations)
     return iteration == first or (first < iteration <= course.n_early and (iteration - first) % LABELLED_EVERY == 0)
@@ -268,10 +267,10 @@ def prepare_kernels(
     image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> None:  # fmt: skip
-    """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
+    """Compile or load the kernels of a method for images of this kind, before a clock starts.
 
-    Several processes compile what the cache does not hold, of which `progress` is told as by
-    `tetopt.system.kernels.link`; a tiny run then loads what is left.
+    Several processes compile the kernels missing from the cache, and report to `progress` like
+    `tetopt.system.kernels.link`; a tiny run then loads the rest.
     """
     content = plain(image)
     image = content.image
@@ -283,7 +282,7 @@ def prepare_kernels(
             "repair": image.ndim == 3,
             "interfaces": has_labels,
             "labelling": has_labels,
-            "nearest": has_labels or content.region is not None,  # what they are measured by afterwards
+            "nearest": has_labels or content.region is not None,  # measures the result afterwards
             "paper_moves": False,
         }
         link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)], progress)
@@ -295,20 +294,20 @@ def prepare_kernels(
         optimize(make_content(tiny, halves), mesh, k_D=k_D, iterations=1)
     if method == "paper":
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
-    elif is_graded:  # nodes are exchanged in the first of two iterations
+    elif is_graded:  # the first of two iterations exchanges nodes
         optimize(tiny, mesh, k_D=k_D, iterations=2, min_dihedral=0.0, nodes=len(mesh.points))
     else:
         optimize(tiny, mesh, k_D=k_D, iterations=1)
 
 
 class Run:
-    """What one optimisation works on, and its steps."""
+    """State and steps of an optimisation."""
 
     def __init__(
         self, content: Content, mesh: Mesh, k_D: float, power: float = SHAPE_POWER, boundary: Boundary = "slide",
         is_graded: bool = False, whole: Whole | None = None,
     ) -> None:  # fmt: skip
-        """As `tetopt.engine.state.state_of`."""
+        """Take the arguments of `tetopt.engine.state.state_of`."""
         self.content, self.image, self.n = content, content.image, content.image.ndim
         self.grid = channel_grid(content, mesh.points, None if whole is None else whole.bits)
         self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded, whole)
@@ -317,12 +316,12 @@ class Run:
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
-        self.label_voxels: LabelVoxels | None = None  # once they are needed
-        # Its variance, estimated when it is first needed.
+        self.label_voxels: LabelVoxels | None = None  # computed when needed
+        # Variance of the noise, estimated when first needed.
         self.image_noise: float | None = None if whole is None else whole.noise
-        self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
-        self.hope = np.full(len(ticks), np.inf)  # what each node's next move may win, (N,); see `sweep`
-        self.n_dropped = 0  # connected components that the mask does not have, taken out
+        self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # positions at which nodes' flips were last evaluated
+        self.hope = np.full(len(ticks), np.inf)  # expected gain of each node's next move, (N,); see `sweep`
+        self.n_dropped = 0  # removed connected components that the mask does not have
 
     @property
     def is_still(self) -> NDArray[np.bool_]:
@@ -344,11 +343,10 @@ class Run:
         self, is_over: Callable[[], bool] = lambda: False, fraction: float = HOPE_FRACTION,
         stars: NodeStars | None = None,
     ) -> bool:  # fmt: skip
-        """Move the nodes that may win something; False if `is_over` cut it short.
+        """Move the nodes with an expected gain; return False if `is_over` cut the sweep short.
 
-        A node may win what its last move did, and what has been won around it since then: the mean over its
-        neighbours, sweep by sweep. It is left alone until that is a fraction of what E is to a node. One whose cells
-        were exchanged may win anything.
+        A node's expected gain is that of its last move plus its neighbours' mean gain in each sweep since. The node is
+        skipped until this reaches a fraction of the mean E per node. It is infinite if the node's cells were exchanged.
         """
         gains = np.zeros(len(self.hope))
         is_active = (self.hope > fraction * self.E() / len(gains)) & ~self.is_still
@@ -359,7 +357,7 @@ class Run:
         return is_finished
 
     def flip(self) -> int:
-        """Exchange cells around the nodes that have moved; the number of exchanges."""
+        """Exchange cells around the nodes that have moved; return the number of exchanges."""
         moved = self._moved(self.ticks_flipped, FLIP_EDGES)
         is_dirty = moved[self.cells].any(axis=1)
         is_touched = np.zeros(len(moved), dtype=bool)
@@ -368,7 +366,7 @@ class Run:
         return n_flips
 
     def _moved(self, since: NDArray[np.int64], fraction: float) -> NDArray[np.bool_]:
-        """Nodes that are more than a fraction of an edge away from `since`, which is brought up to date for them."""
+        """Nodes more than a fraction of an edge away from `since`, which is updated for them."""
         matrix = self.state.objective.matrix
         way = transformed((self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits)
         moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
@@ -376,9 +374,9 @@ class Run:
         return moved
 
     def exchange_towards(self, nodes: int, sizes: Sizes) -> int:
-        """One exchange; towards targets several, while there are far more or fewer nodes; how many were put in or out.
+        """Exchange nodes once, or repeatedly towards targets while the number is far off; return the number of changes.
 
-        Targets are reached from any mesh, also one with a tenth of the nodes; to move them first would be in vain.
+        Targets can be reached from any mesh, even one with a tenth of the nodes; moving nodes first would be futile.
         """
         n_changes = n_last = self.exchange(nodes, sizes)
         while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_FRACTION * nodes:
@@ -387,9 +385,9 @@ class Run:
         return n_changes
 
     def exchange(self, nodes: int, sizes: Sizes) -> int:
-        """Splits and collapses towards a number of nodes; how many nodes were put in or taken out.
+        """Split and collapse edges towards a number of nodes; return the number of inserted and removed nodes.
 
-        A shape's cost is counted at a tenth: most of it goes when the nodes around move again.
+        Shape costs count a tenth, as most of them vanish when the surrounding nodes move again.
         """
         objective = self.state.objective
         if self.image_noise is None:
@@ -397,7 +395,7 @@ class Run:
         points = self.points()
         target = sizes.around(points, self.cells)
         longest = sizes.longest_edges(self.image, nodes, points, self.cells, self.edge, target, self.content.volume)
-        # A step of a voxel between labels always pays, though their surfaces have no detail so fine.
+        # Resolving a voxel's step between labels always pays, although their surfaces have no such fine detail.
         voxel = self.image.voxel_volume ** (1.0 / self.n) if self.content.memberships is not None else 0.0
         shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
         limits = Limits(shortest, longest, self.image_noise, target)
@@ -409,7 +407,7 @@ class Run:
         return made.n_split + made.n_collapsed
 
     def give_labels(self) -> None:
-        """Give each cell a label, if the content has any, and let nodes between labels slide from now on."""
+        """Assign a label to each cell, if the content has labels; nodes between labels slide from then on."""
         if self.content.smooth is None:
             return
         members = self.content.smooth.memberships
@@ -421,10 +419,10 @@ class Run:
         self.ticks_flipped[:] = FAR_TICKS
 
     def attract(self, degrees: float) -> NodeStars:
-        """Let cells take other labels where that pays, and bring nodes between labels to where those meet.
+        """Let cells take other labels where that lowers E, and move nodes between labels onto their interfaces.
 
-        No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none below the minimum.
-        Returns the stars, of which no cell changes.
+        No angle falls below `degrees`; within a mask, where `lift` may be undone, none falls below the minimum. Returns
+        the stars, whose cells do not change.
         """
         ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
         self.state = with_balance(self.state, self.content, self.mesh())
@@ -441,24 +439,24 @@ class Run:
         return stars
 
     def _set_band(self) -> None:
-        """Say how far nodes may be off the surface between two labels."""
+        """Set the distance that nodes may be off the surface between two labels."""
         assert self.content.smooth is not None
         step = self.image.voxel_volume ** (1.0 / self.n)
         self.state.complex.band[:] = self.content.smooth.band * self.edge / step
 
     def keep_min_dihedral(self, degrees: float) -> None:
-        """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
+        """Forbid moves that leave a dihedral angle below `degrees`, or lower one that is below it already."""
         self.state = with_min_dihedral(self.state, degrees)
 
     def n_below(self, degrees: float) -> int:
-        """Tetrahedra with an angle under `degrees`."""
+        """Number of tetrahedra with an angle below `degrees`."""
         return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
     def mend(self, carves: bool, min_dihedral: float, is_late: Callable[[], bool]) -> tuple[int, int]:
-        """Lift cells above `min_dihedral`, degrees, and mend surfaces: again where cells that were taken out made room.
+        """Lift cells above `min_dihedral`, degrees, and mend surfaces; repeat after cells were removed.
 
-        Cells stay flat once `is_late` says so; surfaces are mended all the same. Returns the number of moves, and of
-        cells taken out.
+        Once `is_late` returns True, cells are no longer lifted, but surfaces are still mended. Returns the numbers of
+        moves and of removed cells.
         """
         n_lifted = n_gone = 0
         for _ in range(MEND_ROUNDS):
@@ -470,11 +468,10 @@ class Run:
         return n_lifted, n_gone
 
     def lift(self, degrees: float, carves: bool = False, is_late: Callable[[], bool] = lambda: False) -> int:
-        """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
+        """Lift the worst cells above `degrees`, or as far as possible; return the number of moves. E may rise.
 
-        On the surface of a mask whose details are as small as the cells it may lay cells over one another: more than
-        may be taken out (none, unless it `carves`). Then none of it is done, and cells stay below the minimum dihedral
-        angle.
+        On the surface of a mask with details as small as the cells, it may make more cells overlap than may be removed
+        (none, unless it `carves`). Then it is undone, and cells stay below the minimum dihedral angle.
         """
         before = self.state if self.content.region is None else copied(self.state)
         made = repair(self.state, degrees, is_late)
@@ -488,11 +485,11 @@ class Run:
         return made.n_moves
 
     def mend_surfaces(self, carves: bool, min_dihedral: float = 0.0) -> int:
-        """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by taking out cells; then of interfaces.
+        """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by removing cells; then of interfaces.
 
-        Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two; the octree
-        within a mask has no pinch, but a mesh of the user's may. A few cells on the boundary that nothing lifted over
-        `min_dihedral`, degrees, go, too. Returns how many cells were taken out.
+        Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two. The octree
+        within a mask has no pinches, but a user's mesh may. A few cells on the boundary that nothing lifted above
+        `min_dihedral`, degrees, are removed, too. Returns the number of removed cells.
         """
         n_gone = 0
         if carves and self.content.region is not None:
@@ -510,7 +507,7 @@ class Run:
 
     @property
     def most_gone(self) -> float:
-        """How many cells may be taken out for being flat."""
+        """Largest number of flat cells that may be removed."""
         return max(FLAT_FRACTION * self.n_cells, FLAT_CELLS)
 
     def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
@@ -520,7 +517,7 @@ class Run:
         return int(is_gone.sum())
 
     def _overlapping(self, state: State) -> NDArray[np.bool_]:
-        """Cells, (M,), that hold a voxel centre which a cell before them holds, too."""
+        """Mask of the cells, (M,), with a voxel centre that a previous cell contains, too."""
         points = self.image.to_world(from_ticks(state.complex.ticks, self.grid, self.n))
         mesh = Mesh(points, state.complex.cells[: int(state.complex.n_cells[0])].copy())
         owner = cell_of_voxel(self.image, mesh)
@@ -530,7 +527,7 @@ class Run:
         return np.asarray(state.complex.sums[: len(n_owned), 0] > n_owned)
 
     def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
-        """Take over a state with other nodes: where each comes from, -1 for new ones."""
+        """Adopt a state with other nodes; `source` is each node's previous number, -1 for new ones."""
         is_new = (source < 0)[:, None]
         self.state = state
         self.ticks_flipped = np.where(is_new, FAR_TICKS, self.ticks_flipped[source])
@@ -538,11 +535,11 @@ class Run:
         self.groups, self.edge = blocks(state.complex.ticks), _edges(self.points(), self.cells)
 
     def movement(self, before: NDArray[np.int64]) -> float:
-        """How far the nodes are from where they were, `before` (N, 3) in ticks; see `relative_movement`."""
+        """Relative movement of the nodes since `before` (N, 3), in ticks; see `relative_movement`."""
         return relative_movement(before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix)
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> IterationRecord:
-        """The row of the history that tells how things stand."""
+        """The history's row for the current state."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
         E_G, squares = content_energies(self.state, self.content, self.content.n_channels)
@@ -551,7 +548,7 @@ class Run:
         return IterationRecord(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
 
     def labels(self) -> NDArray[np.int64] | None:
-        """The label of each cell, (M,), if they have any."""
+        """The label of each cell, (M,); None without labels."""
         members = self.content.memberships
         if members is None or not self.has_labels:
             return None
@@ -559,24 +556,24 @@ class Run:
 
     @property
     def cells(self) -> NDArray[np.int64]:
-        """The cells as they stand, (M, n+1); a view."""
+        """The current cells, (M, n+1); a view."""
         return self.state.complex.cells[: self.n_cells]
 
     def points(self) -> NDArray[np.float64]:
-        """The nodes as they stand, (N, n) mm."""
+        """The current nodes, (N, n) mm."""
         points = self.image.to_world(from_ticks(self.state.complex.ticks, self.grid, self.n))
-        if self.kept:  # nodes that may not move come back to the last bit, not rounded to ticks
+        if self.kept:  # fixed nodes keep their exact positions, not rounded to ticks
             for node, place in enumerate(self.state.complex.ticks.tolist()):
                 points[node] = self.kept.get(tuple(place), points[node])
         return points
 
     def mesh(self) -> Mesh:
-        """The mesh as it stands."""
+        """The current mesh."""
         return Mesh(self.points(), self.cells)
 
 
 def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Edge of the regular cell that has the mean volume of the cells around each node, (N,) mm."""
+    """Edge of the regular cell with the mean volume of the cells around each node, (N,) mm."""
     n, around = points.shape[1], cells.ravel()
     total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))
     mean = total / np.maximum(np.bincount(around, minlength=len(points)), 1)
@@ -586,7 +583,7 @@ def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.
 def check_options(
     k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None
 ) -> None:
-    """InputError for an option of `optimize` out of range."""
+    """Raise InputError for an option of `optimize` out of range."""
     check_common_options(k_D, iterations, boundary)
     if not 1.0 <= shape_power <= 10.0:
         raise InputError(f"shape_power: expected 1 (the paper's) to 10, got {shape_power}")
@@ -595,4 +592,4 @@ def check_options(
             f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular tetrahedron has 70.5"
         )
     if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
-        raise InputError(f"nodes: expected a whole number above 2, or None to keep those of the mesh, got {nodes!r}")
+        raise InputError(f"nodes: expected a whole number above 2, or None to keep the mesh's nodes, got {nodes!r}")

@@ -1,15 +1,15 @@
-"""Exchanging cells for others over the same cavity, where that lowers the combined energy.
+"""Exchange cells for others in the same cavity where that lowers the combined energy.
 
 "Accept a tessellation only if it decreases the energy" (Section 4 of the paper), cell by cell. Two moves reach every
 tetrahedralization of a small cavity: the face flip, which replaces the two tetrahedra of a facet by three around a new
 edge (2-3), and the removal of an edge, which replaces the m tetrahedra around it by the 2 (m - 2) of the best
-triangulation of the polygon they leave (3-2, 4-4 and upwards), found by dynamic programming over the polygon's
-diagonals (Klincsek 1980; Shewchuk 2002). An edge in a face of the box has an open polygon, closed by a segment in that
-face. In 2-D the edge of two triangles is turned.
+triangulation of their polygon (3-2, 4-4 and higher), found by dynamic programming over the polygon's diagonals
+(Klincsek 1980; Shewchuk 2002). An edge in a face of the box has an open polygon, closed by a segment in that face. In
+2-D the edge between two triangles is flipped.
 
-What a move is worth is measured for all cells at once, each writing only its own row. Moves are then made one after
-the other, the most worth first, each only if no cell of its cavity has changed since; so the result does not depend on
-the threads, and E falls by what was measured.
+Gains of moves are measured for all cells in parallel, each writing only its own row. Moves are then made one after the
+other, the largest gain first, each only if no cell of its cavity has changed, so that the result does not depend on the
+threads, and E falls by the measured gain.
 """
 
 from __future__ import annotations
@@ -60,35 +60,35 @@ from tetopt.system.kernels import (
     unit,
 )
 
-POLYGON_CORNERS = 7  # corners of the largest polygon around an edge that is triangulated anew
+POLYGON_CORNERS = 7  # corners of the largest polygon around an edge to be triangulated
 LEAST_FLIP_FRACTION = 1e-9  # of the cavity's energy: a smaller gain may be rounding
 TET_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # between corners of a cell
 
 
 class Cavity(NamedTuple):
-    """Room for one cavity at a time."""
+    """Work space for one cavity."""
 
     x: Floats2  # (4, 3) corners of a cell
-    y: Floats2  # (POLYGON_CORNERS + 2, 3) corners of the cavity: of an edge a, b, then the polygon
+    y: Floats2  # (POLYGON_CORNERS + 2, 3) corners of the cavity: the edge's a and b, then the polygon
     ring: Ints1  # (POLYGON_CORNERS,) the polygon's nodes
     around: Ints1  # (POLYGON_CORNERS,) the cells around the edge
-    cost: Floats2  # (POLYGON_CORNERS, POLYGON_CORNERS) of the best triangulation between two corners
-    apex: Ints2  # (POLYGON_CORNERS, POLYGON_CORNERS) the corner between them of its triangle
-    triangle: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each one
-    is_measured: Bools3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) whether the image is in it
+    cost: Floats2  # (POLYGON_CORNERS, POLYGON_CORNERS) cost of the best triangulation between two corners
+    apex: Ints2  # (POLYGON_CORNERS, POLYGON_CORNERS) third corner of its triangle on them
+    triangle: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each triangle
+    is_measured: Bools3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) True if it includes the image
     side_a: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, D) fluxes of the facets (v_j, v_i, a)
     side_b: Floats3  # and (v_i, v_j, b)
-    flux: Floats3  # (3, 1, D) of facets inside the cavity
-    sums: Floats2  # (2, D) of two cells
-    is_side: Bools2  # (POLYGON_CORNERS, POLYGON_CORNERS) whether they are measured
+    flux: Floats3  # (3, 1, D) fluxes of facets inside the cavity
+    sums: Floats2  # (2, D) sums of two cells
+    is_side: Bools2  # (POLYGON_CORNERS, POLYGON_CORNERS) True if these are measured
     stack: Ints2  # (2 POLYGON_CORNERS, 3)
     new: Ints1  # (2 POLYGON_CORNERS,) the cells that will fill the cavity
-    free: Ints1  # (1 + R,) how many cells were left over, and which
-    arc: Ints1  # (1,) how many cells of the first label come first; 0 if all around the edge have one label
+    free: Ints1  # (1 + R,) the number of unused cells, and these
+    arc: Ints1  # (1,) number of leading cells with the first label; 0 if all around the edge have one label
 
 
 def cavity(n_free: int, D: int) -> Cavity:
-    """Room for a cavity, and for the numbers of `n_free` cells left over; D numbers make a flux."""
+    """Allocate a cavity, and space for the numbers of `n_free` unused cells; a flux has D numbers."""
     return Cavity(
         np.empty((4, 3)),
         np.empty((POLYGON_CORNERS + 2, 3)),
@@ -116,11 +116,11 @@ def flip(
     passes: int = 50,
     is_touched: NDArray[np.bool_] | None = None,
 ) -> tuple[State, int]:
-    """Make every move that lowers E until none is left, or for some passes; the state and the number of moves.
+    """Make every move that lowers E until none remains, or for some passes; return the state and the number of moves.
 
-    Only cavities with one of the cells marked in `is_dirty` (C,) are looked at; all of them by default. Nodes of new
-    cells are marked in `is_touched` (N,). The complex of the state returned may be a wider copy of the one before,
-    which is then out of date.
+    Only cavities with a cell marked in `is_dirty` (C,) are evaluated, by default all. Nodes of new cells are marked in
+    `is_touched` (N,). The complex of the returned state may be a larger copy of the previous one, which is then out of
+    date.
     """
     n_cells = int(state.complex.n_cells[0])
     dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
@@ -148,9 +148,9 @@ def flip(
 
 
 def _evaluate(gain: NDArray, move: NDArray, near: NDArray, is_dirty: NDArray, state: State) -> None:
-    """The move worth most of each of the cells `near`, those marked dirty, and its worth, to `move` and `gain` (C,).
+    """Write the best move of each of the cells `near`, those marked dirty, and its gain to `move` and `gain` (C,).
 
-    Each facet and edge is looked at by the lowest of the dirty cells that have it.
+    The lowest dirty cell of each facet and edge evaluates it.
     """
     with few_threads(len(near) * 4):
         task = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
@@ -160,19 +160,19 @@ def _evaluate(gain: NDArray, move: NDArray, near: NDArray, is_dirty: NDArray, st
 
 
 class Evaluation(NamedTuple):
-    """What the moves of all cells are looked for in."""
+    """Inputs and outputs of the search for moves."""
 
-    gain: Floats1  # (C,) of each cell's best move
+    gain: Floats1  # (C,) gain of each cell's best move
     move: Ints1  # (C,) which
-    near: Ints1  # the cells that are marked in `is_dirty`
-    is_dirty: Bools1  # (C,) only cavities with one of these are looked at
+    near: Ints1  # the cells marked in `is_dirty`
+    is_dirty: Bools1  # (C,) only cavities with one of these are evaluated
     state: State
     rooms: list[Cavity]  # one for each thread
 
 
 @unit
 def _evaluate_cells(search: Evaluation, chunk: int) -> None:
-    """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
+    """Evaluate moves: 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
     gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
     work, complex_ = own(search.rooms), state.complex
     first = chunk * CELLS_PER_CHUNK
@@ -180,7 +180,7 @@ def _evaluate_cells(search: Evaluation, chunk: int) -> None:
         cell = near[number]
         for k in range(4):
             other = complex_.across[cell, k]
-            is_others = 0 <= other < cell and is_dirty[other]  # the cell beyond looks at the facet
+            is_others = 0 <= other < cell and is_dirty[other]  # the cell beyond evaluates the facet
             if other >= 0 and not is_others and not is_interface(complex_, cell, k):
                 worth = _worth_of_face(work, state, cell, k)
                 if worth > gain[cell]:
@@ -189,7 +189,7 @@ def _evaluate_cells(search: Evaluation, chunk: int) -> None:
             i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]  # the other two corners, opposite the edge's two facets
             one, other = complex_.across[cell, i], complex_.across[cell, j]
             if (0 <= one < cell and is_dirty[one]) or (0 <= other < cell and is_dirty[other]):
-                continue  # a lower cell has the edge too, and looks at it
+                continue  # a lower cell has the edge, too, and evaluates it
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
             m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, is_dirty)
             if m == 0:
@@ -201,7 +201,7 @@ def _evaluate_cells(search: Evaluation, chunk: int) -> None:
 
 @unit
 def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
-    """How much E falls if the facet's two cells become three; 0 or less, or -inf, if not."""
+    """Reduction of E if the facet's two cells become three; 0 or less, or -inf, if it does not fall."""
     x, y = work.x, work.y
     other = state.complex.across[cell, k]
     u, v, w = outward(state.complex.cells, cell, k)
@@ -210,7 +210,7 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
     load(y, 1, state.complex.ticks, u, p, state.objective)
     load(y, 2, state.complex.ticks, v, p, state.objective)
     load(y, 3, state.complex.ticks, w, p, state.objective)
-    # Six times the volumes of the three cells (p, q, a, b): most facets fail here, before any root is drawn.
+    # Six times the volumes of the three cells (p, q, a, b): most facets fail here, before any root is computed.
     at_q, at_u, at_v, at_w = row(y, 0), row(y, 1), row(y, 2), row(y, 3)
     V_uv, V_vw, V_wu = dot(at_q, cross(at_u, at_v)), dot(at_q, cross(at_v, at_w)), dot(at_q, cross(at_w, at_u))
     if V_uv <= 0.0 or V_vw <= 0.0 or V_wu <= 0.0:
@@ -235,7 +235,7 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
     for r in range(3):
         put_flux(spoke, r, 0, state.complex.ticks, p, q, corner[r], state.objective)
     for r in range(3):
-        s, a = (r + 1) % 3, corner[(r + 2) % 3]  # a: the corner of the facet that is left out
+        s, a = (r + 1) % 3, corner[(r + 2) % 3]  # a: the remaining corner of the facet
         below, above = corner_of(state.complex.cells, cell, a), corner_of(state.complex.cells, other, a)
         for d in range(sums.shape[1]):
             outer = state.complex.fluxes[cell, below, d] + state.complex.fluxes[other, above, d]
@@ -262,10 +262,10 @@ def ring_of_edge(
 ) -> tuple[int, int]:
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
 
-    Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
-    corners, and 1 if it is open, that is if the edge is on the boundary; then there is one cell less than corners. The
-    number is 0 if it would be more than `POLYGON_CORNERS`, or if a lower cell looks at the edge: one marked in `looks`
-    (C,); with (0,) none does.
+    The polygon turns to the right about a to b: cell r has a, b, ring[r] and ring[r + 1]. Returns the polygon's number
+    of corners, and 1 if it is open, that is, if the edge is on the boundary, with one cell fewer than corners. The
+    number is 0 if it exceeds `POLYGON_CORNERS`, or if a lower cell marked in `looks` (C,) evaluates the edge; with (0,)
+    none does.
     """
     a, b = cells[cell, i], cells[cell, j]
     # The other two corners, so that (a, b, v, w) is positively oriented.
@@ -276,11 +276,11 @@ def ring_of_edge(
                 k = c
             else:
                 m = c
-    parity = (i > j) ^ ((i + j) % 2 == 0)  # whether (i, j, k, m), k < m, is an odd permutation
+    parity = (i > j) ^ ((i + j) % 2 == 0)  # True if (i, j, k, m), k < m, is an odd permutation
     if parity:
         k, m = m, k
     v, w = cells[cell, k], cells[cell, m]
-    # Backwards to the first cell, if the boundary is met.
+    # Backwards to the first cell, if the search meets the boundary.
     current, back = cell, v
     front = w
     steps = 0
@@ -317,7 +317,7 @@ def ring_of_edge(
 
 @inlined
 def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
-    """The corner of a tetrahedron that is none of a, b and c."""
+    """The corner of a tetrahedron other than a, b and c."""
     fourth = 0
     for k in range(4):
         if cells[cell, k] not in (a, b, c):
@@ -327,10 +327,10 @@ def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
 
 @helper
 def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
-    """Whether four boundary nodes lie in one face of the box.
+    """True if four boundary nodes lie in one face of the box.
 
-    Not if the boundary is to be kept: their facets are not to be exchanged then. Nor are facets beside the box's faces,
-    though in a plane: a part of a mesh shares them with the next one.
+    False if the boundary is fixed, as its facets must stay, and for coplanar facets off the box's faces, which a part
+    of a mesh may share with another part.
     """
     t, low, high = state.complex.ticks, state.sides.low, state.sides.high
     for axis in range(3):
@@ -343,11 +343,11 @@ def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
 
 @unit
 def turn_to_arcs(work: Cavity, labels: Ints1, m: int, is_open: int) -> bool:
-    """Whether the edge whose cells are in `work` may be removed without a change of topology between labels.
+    """True if the edge whose cells are in `work` may be removed without changing the topology of labels.
 
-    All of its cells have one label; or those of one label come after those of another, two or more of each. Then the
-    polygon is turned so that the first label's come first, `work.arc` of them, and the two facets between the labels
-    are exchanged for the two on the polygon's diagonal from its corner 0 to `work.arc`.
+    Either all of its cells have one label, or two or more cells of one label are followed by two or more of another.
+    Then the polygon is rotated so that the first label's cells come first, `work.arc` of them, and the two facets
+    between the labels are exchanged for those on the polygon's diagonal from its corner 0 to `work.arc`.
     """
     ring, around, n_cells = work.ring, work.around, m - is_open
     n_changes, first = 0, 0
@@ -372,20 +372,20 @@ def turn_to_arcs(work: Cavity, labels: Ints1, m: int, is_open: int) -> bool:
 
 @inlined
 def joins_arcs(work: Cavity, i: int, k: int, j: int) -> bool:
-    """Whether a triangle i < k < j of the polygon would lie in two labels."""
+    """True if a triangle i < k < j of the polygon would lie in two labels."""
     t = work.arc[0]
     return t > 0 and j > t and (0 < i < t or 0 < k < t)
 
 
 @inlined
 def _arc_of(work: Cavity, j: int) -> int:
-    """The first cell around the edge that has the label of the polygon's triangle with the last corner j."""
+    """The first cell around the edge with the label of the polygon's triangle whose last corner is j."""
     return work.arc[0] if 0 < work.arc[0] < j else 0
 
 
 @helper
 def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
-    """By how much the facets between labels cost less once the edge (a, b) is removed."""
+    """Reduction of the energy of facets between labels by removing the edge (a, b)."""
     t, ticks, objective = work.arc[0], state.complex.ticks, state.objective
     if t == 0 or objective.tension == 0.0:
         return 0.0
@@ -397,10 +397,10 @@ def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
 
 @unit
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
-    """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `work.apex` then holds the diagonals.
+    """Reduction of E by removing the edge (a, b), -inf if impossible; `work.apex` then holds the diagonals.
 
-    `ring_of_edge` has filled `work.ring` and `work.around`. apex[i, j] is the corner between i and j of the triangle on
-    the diagonal (i, j), of the best triangulation.
+    `ring_of_edge` has filled `work.ring` and `work.around`. apex[i, j] is the corner between i and j of the best
+    triangulation's triangle on the diagonal (i, j).
     """
     y, ring, around = work.y, work.ring, work.around
     cost, apex, triangle = work.cost, work.apex, work.triangle
@@ -417,8 +417,8 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     load(y, 1, state.complex.ticks, b, a, state.objective)
     for r in range(m):
         load(y, 2 + r, state.complex.ticks, ring[r], a, state.objective)
-    # A triangulation's shape energy alone is a lower bound, and cheap; so are its two ears, triangles of three corners
-    # in a row: few edges get past them.
+    # A triangulation's shape energy alone is a cheap lower bound, and so is that of its two ears, triangles of three
+    # successive corners: few edges pass them.
     if m > 4:
         low, lower = np.inf, np.inf  # the two cheapest ears
         for k in range(m):
@@ -438,7 +438,7 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
                     triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
     if not best_triangulation(cost, apex, triangle, m) < limit:
         return -np.inf
-    # The angles last: few edges come so far, and they cost more than energies (half of a pass, when first).
+    # Angles come last: few edges get here, and angles take more time than energies (half of a pass, if first).
     if state.objective.angle_limit > -1.0:
         least = state.objective.angle_limit
         for r in range(m - is_open):
@@ -452,8 +452,8 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
             return -np.inf
     if state.objective.image == 0.0:
         return old - cost[0, m - 1]
-    # Then the image, only for the triangles of the best triangulation, until it is the best with it: a triangle that
-    # is not measured has its least possible energy, so no better triangulation is passed over.
+    # Then the image, only for the triangles of the best triangulation, until it remains the best: a triangle that is
+    # not measured has its least possible energy, so no better triangulation is missed.
     for i in range(m):
         for k in range(m):
             work.is_side[i, k] = False
@@ -467,7 +467,7 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
 
 @unit
 def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> bool:
-    """Add their image energy to the triangles of the triangulation in `apex`; whether one had not had it."""
+    """Add the image energy to the triangles of the triangulation in `apex`; return True if any lacked it."""
     stack, side_a, side_b, ring = work.stack, work.side_a, work.side_b, work.ring
     stack[0, 0], stack[0, 1] = 0, m - 1
     height = 1
@@ -555,7 +555,7 @@ def best_triangulation(cost: Floats2, apex: Ints2, triangle: Floats3, m: int) ->
 
 @unit
 def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int, is_open: int) -> None:
-    """Fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a), unless known: on the polygon's sides the old cells'."""
+    """Fill in unknown fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a): the old cells' on the polygon's sides."""
     if work.is_side[i, j]:
         return
     work.is_side[i, j] = True
@@ -566,7 +566,7 @@ def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int
             work.side_b[i, j, d] = sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, a), d]
             work.side_a[i, j, d] = sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, b), d]
         return
-    for which in range(2):  # one place where the flux is measured: half the code to compile
+    for which in range(2):  # a single call that measures fluxes halves the code to compile
         p, q, end = (work.ring[i], work.ring[j], b) if which == 0 else (work.ring[j], work.ring[i], a)
         side = work.side_b if which == 0 else work.side_a
         put_flux(side, i, j, state.complex.ticks, p, q, end, state.objective)
@@ -574,9 +574,9 @@ def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int
 
 @entry
 def make_moves(order: Ints1, move: Ints1, is_dirty: Bools1, state: State, work: Cavity) -> int:
-    """Make the moves of the cells in `order` whose cavities are as they were; the number made.
+    """Make the moves of the cells in `order` whose cavities are unchanged; return their number.
 
-    Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
+    Cells of a changed cavity are marked dirty, and unused ones are removed at the end.
     """
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
@@ -614,10 +614,10 @@ def make_moves(order: Ints1, move: Ints1, is_dirty: Bools1, state: State, work: 
 
 @unit
 def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: Bools1) -> None:
-    """Numbers of the cells that fill a cavity, to `work.new`: first those that it had, `n_old` in `work.around`.
+    """Write the numbers of the cells that fill a cavity to `work.new`: first its `n_old` cells in `work.around`.
 
-    Further ones are of cells left over before, or from the end; those left over now are marked by a corner of -1. All
-    are marked dirty.
+    Further numbers are those of unused cells, or from the end; cells that become unused are marked by a corner of -1.
+    All are marked dirty.
     """
     for r in range(max(n_old, n_new)):
         if r < n_old:
@@ -639,7 +639,7 @@ def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: Boo
 
 @unit
 def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -> None:
-    """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
+    """Replace two cells by three around the edge (p, q) between the corners opposite their facet (u, v, w)."""
     cells, across, fluxes, objective = state.complex.cells, state.complex.across, state.complex.fluxes, state.objective
     other = across[cell, k]
     u, v, w = outward(cells, cell, k)
@@ -687,7 +687,7 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -
 
 @helper
 def join(across: NDArray, cell: int, k: int, other: int, m: int) -> None:
-    """Let facet k of a cell and facet m of another be one; or the boundary's, if there is none other: -1."""
+    """Link facet k of a cell with facet m of another, or with the boundary if `other` is -1."""
     across[cell, k] = other
     if other >= 0:
         across[other, m] = cell
@@ -695,9 +695,9 @@ def join(across: NDArray, cell: int, k: int, other: int, m: int) -> None:
 
 @helper
 def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDArray:
-    """What lies beyond the sides of the polygon in `work`, over the node: row r (cell, its facet that leads here).
+    """The cells beyond the sides of the polygon in `work`, over the node: row r (cell, its facet that leads here).
 
-    -1 where that is nothing, and in the last row of an open polygon.
+    Rows are -1 outside the mesh, and in the last row of an open polygon.
     """
     cells, across = state.complex.cells, state.complex.across
     beyond = np.empty((POLYGON_CORNERS, 2), dtype=np.int64)
@@ -713,19 +713,19 @@ def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDAr
 
 @unit
 def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int, is_dirty: Bools1) -> None:
-    """The cells around (a, b) become pairs over the triangles of the polygon in `work.apex`; see `_worth_of_edge`.
+    """Replace the cells around (a, b) by pairs over the triangles of the polygon in `work.apex`; see `_worth_of_edge`.
 
-    The sides of its triangles have their fluxes, if the image counts.
+    The sides of its triangles have known fluxes, if the image has weight.
     Over the triangle (i, k, j), i < k < j: (v_i, v_k, v_j, b) and (v_i, v_j, v_k, a).
     """
     cells, across, ring, new = state.complex.cells, state.complex.across, work.ring, work.new
     labels = state.complex.labels
     one, other = labels[work.around[0]], labels[work.around[work.arc[0]]]
-    beyond_a = _beyond_polygon(work, state, b, m - is_open)  # opposite b, on the side of a
+    beyond_a = _beyond_polygon(work, state, b, m - is_open)  # beyond the facets opposite b, on the side of a
     beyond_b = _beyond_polygon(work, state, a, m - is_open)
     take_cells(work, state, m - is_open, 2 * (m - 2), is_dirty)
     # The triangle under each diagonal (i, j), numbered; its two cells are new[2 t] and new[2 t + 1].
-    stack = work.stack  # of i, j and (triangle above) * 4 + its facet towards this one
+    stack = work.stack  # rows of i, j and (triangle above) * 4 + its facet towards this one
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, m - 1, -1
     height, count = 1, 0
     while height > 0:
@@ -741,7 +741,7 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
         labels[top] = labels[low] = one if _arc_of(work, j) == 0 else other
         join(across, top, 3, low, 3)
         _put_pair_fluxes(work, state, top, low, i, k, j)
-        # The side (i, j): the triangle above, or what is beyond the closing side of the polygon.
+        # The side (i, j): the triangle above, or the cell beyond the closing side of the polygon.
         if up >= 0:
             facet = up % 4
             join(across, top, 1, new[2 * (up // 4)], facet)
@@ -749,7 +749,7 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
         else:
             join(across, top, 1, beyond_b[m - 1, 0], beyond_b[m - 1, 1])
             join(across, low, 2, beyond_a[m - 1, 0], beyond_a[m - 1, 1])
-        # The sides (i, k) and (k, j): a side of the polygon, or a diagonal still to come.
+        # The sides (i, k) and (k, j): a side of the polygon, or a diagonal that follows.
         for p, q, facet_top, facet_low in ((i, k, 2, 1), (k, j, 0, 0)):
             if q == p + 1:
                 join(across, top, facet_top, beyond_b[p, 0], beyond_b[p, 1])
@@ -763,7 +763,7 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
 
 @helper
 def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: int, j: int) -> None:
-    """Fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the image does not count."""
+    """Write the fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the image has no weight."""
     fluxes, side_a, side_b, ring = state.complex.fluxes, work.side_a, work.side_b, work.ring
     has_image = state.objective.image > 0.0
     for d in range(fluxes.shape[2]):
@@ -780,7 +780,7 @@ def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: 
 
 @unit
 def close_gaps(state: State, is_dirty: Bools1) -> None:
-    """Move the last cells into the places of those that were taken out."""
+    """Move the last cells into the places of removed ones."""
     cells, across, fluxes, sums = state.complex.cells, state.complex.across, state.complex.fluxes, state.complex.sums
     E_shape = state.complex.E_shape
     n = cells.shape[1]
@@ -818,7 +818,7 @@ def close_gaps(state: State, is_dirty: Bools1) -> None:
 
 @unit
 def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
-    """Moves 0 to 2 turn that edge."""
+    """Evaluate moves 0 to 2, which flip that edge."""
     gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
     x, sums, complex_ = np.empty((4, 3)), np.empty((2, state.complex.sums.shape[1])), state.complex
     first = chunk * CELLS_PER_CHUNK
@@ -826,7 +826,7 @@ def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
         cell = near[number]
         for k in range(3):
             other = complex_.across[cell, k]
-            is_others = 0 <= other < cell and is_dirty[other]  # the triangle beyond looks at the edge
+            is_others = 0 <= other < cell and is_dirty[other]  # the triangle beyond evaluates the edge
             if other >= 0 and not is_others and not is_interface(complex_, cell, k):
                 worth = _worth_of_turn(x, sums, state, cell, k)
                 if worth > gain[cell]:
@@ -835,7 +835,7 @@ def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
 
 @unit
 def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -> float:
-    """How much E falls if the edge (u, v) between two triangles is turned to (p, q); -inf if it cannot be."""
+    """Reduction of E by flipping the edge (u, v) between two triangles to (p, q); -inf if impossible."""
     ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes
     objective = state.objective
     other = across[cell, k]
@@ -862,7 +862,7 @@ def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -
 
 @unit
 def _turn_edge(state: State, cell: int, k: int) -> None:
-    """Triangles (p, u, v) and (q, v, u) become (p, u, q) and (p, q, v)."""
+    """Replace triangles (p, u, v) and (q, v, u) by (p, u, q) and (p, q, v)."""
     ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes
     objective = state.objective
     other = across[cell, k]

@@ -1,8 +1,8 @@
-"""Interfaces between labels: which cells they lie between, where their nodes slide, and what E counts of them.
+"""Interfaces between labels: their cells, their sliding nodes, and their part of E.
 
-A cell begins with the label that the voxels in it, tension and topology ask for (`tetopt.engine.labelling`). From then
-on labels change only with the mesh: cells beside an interface take the label of a neighbour where that lowers E and
-leaves both labels' topology as it is.
+The initial label of a cell follows from its voxels, tension and topology (`tetopt.engine.labelling`). From then on
+labels change only with the mesh: cells beside an interface take the label of a neighbour if that lowers E and
+preserves both labels' topology.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import Bools1, Floats1, Ints1, entry, helper, unit
 
-FEWEST_CENTRES = 20  # of voxels in a cell whose labels they tell; in smaller ones levels are sampled
-SAMPLED_FRACTION = 0.5  # of a label's voxels: of one that samples show less of its centres are counted, too
-SAMPLED_AT_ONCE = 20_000  # cells, by each thread
-BALANCE_LEAK = 0.8  # of the bias of a label stays that has its volume but for
-SMALL_LOSS_FRACTION = 0.04  # of it: facets cut off what is round for good, which would raise a bias for ever
-SPARED_LOSS_FRACTION = 0.08  # of a label's volume: to make up for all of it where it is left costs its place, Dice
-SHIFT_STEP = 0.5  # of what would make up for the volume
-MOST_SHIFT_FRACTION = 0.2  # of the edge beside a label's surface
-RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
-LEAST_RELABELLING_FRACTION = 1e-9  # of the energies weighed: a smaller gain may be rounding
+FEWEST_CENTRES = 20  # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
+SAMPLED_FRACTION = 0.5  # of a label's voxels: if samples show less, its centres are counted, too
+SAMPLED_AT_ONCE = 20_000  # cells per thread
+BALANCE_LEAK = 0.8  # fraction of its bias that a label keeps if its volume is right, except for
+SMALL_LOSS_FRACTION = 0.04  # of the volume: facets always cut it off round shapes, which would raise the bias forever
+SPARED_LOSS_FRACTION = 0.08  # of a label's volume that is not restored: restoring all of it would cost position (Dice)
+SHIFT_STEP = 0.5  # fraction of the shift that would restore the volume
+MOST_SHIFT_FRACTION = 0.2  # largest shift, of the edge beside a label's surface
+RELABELLING_PASSES = 10  # at most; the third usually changes nothing
+LEAST_RELABELLING_FRACTION = 1e-9  # of the energies compared: a smaller gain may be rounding
 
 
 def with_labels(
     state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, voxels: LabelVoxels | None = None
 ) -> State:
-    """The state with a label for each cell, of the content's, and an objective that counts what is not of it.
+    """The state with one of the content's labels for each cell, and an objective that penalises other labels' voxels.
 
-    `voxels` is what the labels' voxels say of any mesh (`label_voxels`), if it is known. Labels that cells have already
-    say what volume each label has lost or won, and its bias is brought up to date.
+    `voxels` is the information on the labels' voxels (`label_voxels`), if known. If cells already have labels, each
+    label's bias is updated for the volume that it has lost or gained.
     """
     members, tension, own_channel, own_value, keeps_volumes, _ = smooth
     bias = None if keeps_volumes else np.zeros(len(members.labels))
@@ -84,10 +84,10 @@ def with_labels(
 
 
 def with_balance(state: State, content: Content, mesh: Mesh) -> State:
-    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are kept.
+    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are preserved.
 
-    What cells of the label cannot make up for, since nodes on its surface cut off what is round, its surface does,
-    which goes outwards by a shift of the label's level; inwards where the label has far too much.
+    Cells cannot restore the volume that nodes on a round surface cut off. A shift of the label's level therefore moves
+    its surface outwards, or inwards if the label has far too much volume.
     """
     if content.smooth is None or not content.smooth.keeps_volumes:
         return state
@@ -108,7 +108,7 @@ def with_balance(state: State, content: Content, mesh: Mesh) -> State:
 def _shifted(
     shift: NDArray[np.float64], missing: NDArray[np.float64], state: State, mesh: Mesh, step: float
 ) -> NDArray[np.float64]:
-    """How far out labels' surfaces are, (K,) voxels of `step` mm, to give labels the volume that is missing, mm^n."""
+    """Outward shifts of labels' surfaces, (K,) voxels of `step` mm, that give labels their missing volume, mm^n."""
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     is_between = (across >= 0) & (labels[across] != labels[:, None])
     beside, n = np.flatnonzero(is_between.any(axis=1)), mesh.points.shape[1]
@@ -134,9 +134,9 @@ def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, v
 def cell_contents(
     image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels
 ) -> tuple[scipy.sparse.csr_array, Contacts]:
-    """Voxels of each label in each cell, (M, K), and where labels touch; by samples where a cell holds few centres.
+    """Voxels of each label in each cell, (M, K), and contacts of labels; cells with few centres are sampled.
 
-    A cell of a thin sheet may hold one centre, or none. What is sampled are the levels, at the centres of equal parts.
+    A cell of a thin sheet may contain one centre, or none. Levels are sampled at the centres of equal parts.
     """
     n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
     owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
@@ -159,7 +159,7 @@ def cell_contents(
     row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
     _sum_kinds(row, volume, first, entries, start, each, n_labels)
     counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
-    # Between the samples a label of a voxel or two is not seen: it has its centres.
+    # Samples may miss a label of a voxel or two, so its centres count.
     is_unseen = np.bincount(row, volume, n_labels) < SAMPLED_FRACTION * n_of
     if is_unseen.any():
         centre = np.flatnonzero(is_unseen[partition] & (owner >= 0))
@@ -191,7 +191,7 @@ def _place_centres(entries: NDArray, end: NDArray, owner: NDArray, partition: ND
 
 @njit(cache=True, nogil=True)
 def _count_kinds(first: NDArray, entries: NDArray, start: NDArray, n_labels: int) -> None:
-    """Count the labels that each cell has any of."""
+    """Count the labels present in each cell."""
     last = np.full(n_labels, -1, dtype=np.int64)
     for cell in range(len(start) - 1):
         for i in range(start[cell], start[cell + 1]):
@@ -223,7 +223,7 @@ def _sum_kinds(
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:
-    """Barycentric places (S, n+1), of the simplex's points that divide its edges into parts those moved inside."""
+    """Barycentric places (S, n+1): the points that divide a simplex's edges into parts, moved inside."""
     whole = np.array([each for each in itertools.product(range(parts + 1), repeat=n + 1) if sum(each) == parts])
     return (whole + 0.5) / (parts + 0.5 * (n + 1))
 
@@ -232,14 +232,14 @@ PART_CENTRES = {2: _samples(2, 4), 3: _samples(3, 3)}  # 15 and 20 barycentric p
 
 
 def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
-    """Nodes between more labels than they are brought to (`MOST_MEETING`); cells (M, n+1), their labels (M,)."""
+    """Nodes with more labels than they can be moved onto (`MOST_MEETING`); cells (M, n+1), their labels (M,)."""
     pairs = np.unique(np.column_stack([cells.ravel(), np.repeat(of_cell, cells.shape[1])]), axis=0)
     return int((np.bincount(pairs[:, 0]) > MOST_MEETING).sum())
 
 
 @unit
 def _meet(state: State, stars: NodeStars, node: int) -> None:
-    """Note which labels the cells around a node have."""
+    """Store the labels of the cells around a node."""
     meeting, count = state.complex.meeting[node], 0
     for m in range(MOST_MEETING):
         meeting[m] = -1
@@ -265,11 +265,11 @@ def _meet_everywhere(state: State, stars: NodeStars) -> None:
 
 
 def relabel(state: State, stars: NodeStars) -> int:
-    """Let cells beside an interface take a neighbour's label where E falls and no topology changes; how many did."""
+    """Let cells beside an interface take a neighbour's label if E falls and no topology changes; return the number."""
     n_cells, total = int(state.complex.n_cells[0]), 0
     gain, label, is_stale = np.zeros(n_cells), np.zeros(n_cells, dtype=np.int64), np.ones(n_cells, dtype=bool)
     for _ in range(RELABELLING_PASSES):
-        # After the first pass only cells that moved, and those beside them: a sixth of the time of all cells.
+        # After the first pass only changed cells and their neighbours, in a sixth of the time of all cells.
         _find_relabellings(gain, label, state, np.flatnonzero(is_stale))
         is_stale[:] = False
         order = np.flatnonzero(gain > 0.0)
@@ -282,7 +282,7 @@ def relabel(state: State, stars: NodeStars) -> int:
 
 @unit
 def _price(state: State, cell: int, label: int) -> float:
-    """What a cell costs with a label, as far as the label matters."""
+    """The part of E that depends on a cell's label."""
     mesh, objective = state.complex, state.objective
     price = objective.image * image_energy(mesh.sums, cell, label, objective)
     for k in range(mesh.cells.shape[1]):

@@ -1,21 +1,21 @@
-"""Which label each cell has: labels whole, their interfaces short and manifold.
+"""Labels of cells: connected labels with short, manifold interfaces.
 
-The labels minimise a Potts energy on the dual graph of a mesh that stays as it is (Boykov, Veksler, Zabih 2001),
+The labels minimise a Potts energy on the dual graph of a fixed mesh (Boykov, Veksler, Zabih 2001),
 
-    sum over cells of the volume of voxels that are not of the cell's label
+    sum over cells of the volume of voxels with other labels than the cell's
     - sum over cells of the bias of the cell's label x its volume
     + sum over facets between cells of different labels of tension x area,
 
-a surface tension in mm: how far a surface would move to save itself. A ball smaller than three of it in radius, or a
-sheet thinner than two, costs more than it is worth. A label that is thinner than cells has most of the voxels in few
-of them: its bias, one number, is raised until its cells have its volume. Between labels that touch nowhere in the
-voxels, or at a few places, the tension is higher: cells between them get the label of the sheet that parts them there,
-rather than tear it. From the labels that most voxels of each cell have, cells take
-the label of a neighbour, the best move first, as long as the energy falls. Then components of cells that no component
-of voxels justifies go to their neighbours, and what is not manifold is mended by the cells around it that cost least.
+where the tension, in mm, is the distance that a surface would move to reduce its area. A ball with a radius below three
+tensions, or a sheet thinner than two, costs more than it gains. A label that is thinner than cells has most of the
+voxels in few of them: its bias, one number, is raised until its cells have its volume. The tension is higher between
+labels that touch nowhere in the voxels, or only at a few places: cells between them get the label of the sheet that
+separates them, which would tear otherwise. Starting from the label of most voxels in each cell, cells take the label of
+a neighbour, the best move first, as long as the energy falls. Then components of cells that no component of voxels
+justifies go to their neighbours, and places that are not manifold are mended by the cheapest cells around them.
 
-An interface is manifold at an edge or a node if, of each label there, the cells around it are one fan, and all
-others, with the outside among them, are one, too: linked by facets that contain the edge or the node.
+An interface is manifold at an edge or a node if, for each label there, its cells around it form one fan, and all other
+cells including the outside form one fan, too: linked by facets that contain the edge or the node.
 """
 
 from __future__ import annotations
@@ -33,62 +33,62 @@ from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_FRACTION = (
-    0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
+    0.1  # of the local edge: a regular cell with three facets to one label takes it, unless nearly full of its own
 )
-LEAST_FRACTION = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
-LAST_FRACTION = 0.1  # of that: mending may take more in the end, rather than leave a pinch
-# of the voxels of a component of cells that a component of voxels has at least, if it is to justify it
+LEAST_FRACTION = 0.5  # of a label's volume that tension must leave, so that small labels do not vanish
+LAST_FRACTION = 0.1  # of that, which mending must leave: it may finally take more, rather than leave a pinch
+# least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
 COMPONENT_FRACTION = 0.5
-BRIDGE_RATIO = 3.0  # of the voxels lost with a component: what a bridge may cost; with 1 a coarse mesh loses half a rib
-MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
-TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: what is not manifold between two labels goes at any cost
-MORE_LABELS_WEIGHT = 0.3  # where more labels meet: edges go with it, and with 4 a tenth of small organs' Dice, too
-APART_TENSION = 10.0  # times the usual, between labels that the voxels there keep apart
-PLACE_TENSION = 3.0  # likewise, where they touch
-APART_WEIGHT = 10.0  # where such labels meet at a node or an edge alone: a sheet between them is pierced
-LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs that touch less do so at places, not everywhere
-BALANCE_ROUNDS = 10  # of labelling and balancing, where no bias is known; more hardly change it
-BALANCE_STEP = 3.0  # times the fraction of its volume that a label lacks: its bias rises so much,
+BRIDGE_RATIO = 3.0  # cost of a bridge relative to the voxels lost otherwise; with 1 a coarse mesh loses half a rib
+MENDING_ROUNDS = 6  # of fragments and mending, at most; the second usually has nothing left to do
+TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: pinches between two labels are removed at any cost
+MORE_LABELS_WEIGHT = 0.3  # where more labels meet: this removes edges; with 4, small organs lose a tenth of their Dice
+APART_TENSION = 10.0  # times the usual, between labels that are separate in the voxels
+PLACE_TENSION = 3.0  # the same, at places where they touch
+APART_WEIGHT = 10.0  # where such labels meet only at a node or an edge: a sheet between them is pierced
+LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs with less contact touch only at places
+BALANCE_ROUNDS = 10  # of labelling and balancing, if no bias is known; more hardly change it
+BALANCE_STEP = 3.0  # rise of a label's bias, times the fraction of its volume that it lacks,
 LONGEST_BALANCE_STEP = 0.1  # at most,
-FIRST_BALANCE_STEP = 0.2  # and so much where labels are given at once
-# of a label's volume may go, and come, where labels are given anew with the bias that made up for losses since: in
-# cells that are far larger than a label is thick such a bias gives or takes several times its volume
+FIRST_BALANCE_STEP = 0.2  # and in a single assignment of labels
+# largest loss and gain of a label's volume when labels are reassigned with the bias that compensated for losses since:
+# in cells much larger than a label's thickness, such a bias gives or takes several times its volume
 MOST_SWING = (0.15, 0.4)
-SWING_ROUNDS = 4  # at most, in which they are given again
-MOST_BIAS = 0.9  # of a cell's volume: a label of which a cell has less than a twentieth does not get it
-LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
+SWING_ROUNDS = 4  # of reassigning them, at most
+MOST_BIAS = 0.9  # of a cell's volume: a label with less than a twentieth of a cell does not get it
+LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 
 
 class Contacts(NamedTuple):
-    """Which labels touch in the voxels."""
+    """Contacts of labels in the voxels."""
 
-    is_apart: Bools2  # (K, K) pairs that do not touch, or at few places alone
-    is_place: Bools1  # (M,) cells that have a voxel at such a place
+    is_apart: Bools2  # (K, K) pairs that do not touch, or only at few places
+    is_place: Bools1  # (M,) cells with a voxel at such a place
 
 
 class LabelVoxels(NamedTuple):
-    """What the voxels of labels say of any mesh; made by `label_voxels`."""
+    """Information on the voxels of labels for any mesh; made by `label_voxels`."""
 
-    components: list[NDArray[np.int64]]  # voxels in each component of each label, falling
-    is_apart: NDArray[np.bool_]  # (K, K) as of `Contacts`
-    places: NDArray[np.int64]  # voxels, as numbers of the flat grid, beside one of a label that is apart from theirs
+    components: list[NDArray[np.int64]]  # voxels in each component of each label, descending
+    is_apart: NDArray[np.bool_]  # (K, K) as in `Contacts`
+    places: NDArray[np.int64]  # flat indices of voxels beside one of a label that is apart from theirs
 
 
 class Labelling(NamedTuple):
-    """The label of each cell, as rows of the labels, and what is left undone."""
+    """The label of each cell, as rows of the labels, and remaining defects."""
 
     labels: NDArray[np.int64]  # (M,)
-    n_moved: int  # cells whose label is not the one of most of their voxels
-    n_nonmanifold_edges: int  # where only two labels meet; nodes in 2-D have no edges, 0
+    n_moved: int  # cells whose label is not that of most of their voxels
+    n_nonmanifold_edges: int  # where only two labels meet; 0 in 2-D
     n_nonmanifold_nodes: int
-    components: NDArray[np.int64]  # (K,) components of cells, linked by facets
+    components: NDArray[np.int64]  # (K,) number of components of cells, linked by facets
     lost: NDArray[np.int64]  # labels with voxels but without cells
-    bias: NDArray[np.float64]  # (K,) of labels, with which they were found
+    bias: NDArray[np.float64]  # (K,) bias of labels that led to them
 
 
 class Dual(NamedTuple):
-    """A mesh as its cells touch each other, and what each cell holds."""
+    """Adjacency of a mesh's cells, and their voxels."""
 
     cells: Ints2  # (M, n+1)
     across: Ints2  # (M, n+1) the cell beyond each facet; -1 outside
@@ -96,12 +96,12 @@ class Dual(NamedTuple):
     star_cells: Ints1  # (M (n+1),) the cells around each node, ascending
     size: Floats1  # (M,) volumes, mm^n
     scale: Floats1  # (N,) mean volume of the cells around each node
-    tension: Floats2  # (M, n+1) what each facet costs between different labels, mm^n; 0 on the boundary
-    first: Ints1  # (M+1,) where each cell's row of voxels begins
+    tension: Floats2  # (M, n+1) cost of each facet between different labels, mm^n; 0 on the boundary
+    first: Ints1  # (M+1,) start of each cell's row of voxels
     row: Ints1  # labels in it
     volume: Floats1  # of their voxels in it, mm^n
     contacts: Contacts
-    bias: Floats1  # (K,) what each label is worth besides, by volume; see `labelled`
+    bias: Floats1  # (K,) bonus of each label, by volume; see `labelled`
 
 
 def labelled(
@@ -109,10 +109,10 @@ def labelled(
     components: list[NDArray], contacts: Contacts | None = None, bias: NDArray[np.float64] | None = None,
     weight: float | None = None,
 ) -> Labelling:  # fmt: skip
-    """The label of each cell of a mesh: close to the voxels in it, interfaces short and manifold, no fragments.
+    """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without fragments.
 
-    It ends, since every move but that of fragments lowers an energy, and fragments go at most `MENDING_ROUNDS` times.
-    A label that most voxels of a cell have keeps a cell at least.
+    The iteration ends, since every move except that of fragments lowers an energy, and fragments are moved at most
+    `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps at least one cell.
 
     Parameters
     ----------
@@ -123,15 +123,15 @@ def labelled(
     across : (M, n+1) int64
         The cell beyond each facet, opposite each corner; -1 outside.
     counts : (M, K) sparse array in rows
-        Voxels of each label in each cell, with fractions of a voxel where a cell holds no centre. No row is empty.
+        Voxels of each label in each cell, with fractions of a voxel if a cell contains no centre. No row is empty.
     components : list of K arrays
-        Voxels in each component of each label, falling: `voxel_components`. As many components of cells may stay.
+        Voxels in each component of each label, descending: `voxel_components`. As many components of cells may stay.
     contacts : Contacts, optional
-        Which labels the voxels keep apart; none by default.
+        Labels that are separate in the voxels; none by default.
     bias : (K,) float64, optional
-        What each label is worth besides, as a fraction of a cell's volume; by default what keeps the labels' volumes,
-        as far as it can: a label that is thinner than cells has most of the voxels in few of them. One that is given
-        is kept, unless labels take far more than their volumes by it, or far less (`MOST_SWING`).
+        Bonus of each label, as a fraction of a cell's volume. By default it preserves the labels' volumes as far as
+        possible: a label that is thinner than cells has most of the voxels in few of them. A given bias is kept, unless
+        labels would get far more or far less than their volumes (`MOST_SWING`).
     weight : float, optional
         Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
@@ -182,9 +182,9 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
 def _without_swing(
     dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64], voxel: float, components: list[NDArray]
 ) -> NDArray[np.int64]:
-    """Labels, (M,), with as little volume as possible beyond `MOST_SWING` of `aim`; the dual's bias is theirs.
+    """Labels, (M,), with as little volume as possible beyond `MOST_SWING` of `aim`; updates the dual's bias.
 
-    The bias that made up for what labels have lost since they were given may be far too strong for labels given anew.
+    The bias that compensated for the labels' losses since their assignment may be far too strong for a new one.
     """
     fewest = np.inf
     for _ in range(1 + SWING_ROUNDS):
@@ -205,9 +205,9 @@ def unpinched(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     contacts: Contacts | None, labels: NDArray[np.int64],
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Labels of cells, (M,), with as few changed as make interfaces of two labels manifold, whatever they cost.
+    """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold, at any cost.
 
-    Arguments as of `labelled`; no label loses its last cell. What cannot be mended is left.
+    Arguments as for `labelled`; no label loses its last cell. Pinches that cannot be mended remain.
     """
     dual, labels = _dual(points, cells, across, counts, contacts, None), labels.copy()
     _mend_pairs(dual, labels, np.full(counts.shape[1], float(dual.size.min())))
@@ -215,7 +215,7 @@ def unpinched(
 
 
 def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
-    """Give labels without cells the one that has most of them, unless that is far more of others."""
+    """Give each label without cells the cell with most of it, unless that has far more of others."""
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     n_of = np.bincount(labels, minlength=len(dual.bias))
     for label in np.setdiff1d(dual.row, labels):
@@ -228,7 +228,7 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
 
 
 def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The bias by which labels have most nearly their volumes `aim`: steps are halved where they went too far."""
+    """Find the bias that gives labels nearly their volumes `aim`; steps are halved if they go too far."""
     longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
@@ -243,21 +243,21 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
 def balanced(
     bias: NDArray[np.float64], aim: NDArray, volume: NDArray, longest: NDArray | float = LONGEST_BALANCE_STEP
 ) -> NDArray[np.float64]:
-    """The bias of each label, raised where its volume is below its aim, lowered where it is above; all (K,)."""
+    """The bias of each label, raised if its volume is below its aim, lowered if it is above; all (K,)."""
     missing = np.where(aim > 0.0, 1.0 - volume / np.where(aim > 0.0, aim, 1.0), 0.0)
     step = np.clip(BALANCE_STEP * missing, -longest, longest)
     return np.asarray(np.clip(bias + step, -MOST_BIAS, MOST_BIAS))
 
 
 def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
-    """Voxels in each component of each label of a grid, falling; linked by faces."""
+    """Voxels in each face-connected component of each label of a grid, descending."""
     boxes = scipy.ndimage.find_objects(partition + 1, n_labels)
     parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
     return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
 
 
 def label_voxels(partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int) -> LabelVoxels:
-    """Components of labels in the voxels of a grid, pairs that share hardly any area, and where those touch."""
+    """Components of labels in the voxels of a grid, pairs that share hardly any area, and places where these touch."""
     steps = [np.moveaxis(partition, d, 0) for d in range(partition.ndim)]
     area = np.zeros(n_labels * n_labels)
     for rows, step in zip(steps, spacing, strict=True):
@@ -298,7 +298,7 @@ def _dual(
     )
     tension = np.full(across.shape, weight)
     if weight is None:
-        # The edge of a regular cell of that volume: thin cells do not make a surface dear.
+        # The edge of a regular cell of that volume, so that thin cells do not make a surface expensive.
         edge = regular_edge(size, n)
         tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
     tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
@@ -322,7 +322,7 @@ def _dual(
 
 
 def _majority(dual: Dual) -> NDArray[np.int64]:
-    """The label that most voxels of each cell have, of equally many the first."""
+    """The most frequent label in each cell, the first of equally frequent ones."""
     labels = np.empty(len(dual.cells), dtype=np.int64)
     _fill_majority(labels, dual)
     return labels
@@ -339,15 +339,15 @@ def _fill_majority(labels: Ints1, dual: Dual) -> None:
 
 
 def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool) -> int:
-    """Cells take the label of a neighbour while the energy falls, the best moves first; how many did.
+    """Let cells take a neighbour's label while the energy falls, the best moves first; return their number.
 
-    Tension alone takes no label below its volume `least`. With care only where no label's topology changes.
+    Tension alone lowers no label below its volume `least`. If `is_careful`, no label's topology changes.
     """
     room = np.bincount(labels, dual.size, len(least)) - least
     n_of = np.bincount(labels, minlength=len(least))
     total, gains, is_stale = 0, np.zeros(len(labels)), np.ones(len(labels), dtype=bool)
     while True:
-        # Only cells that moved, and those beside them: of a head's 720,000 cells a fifth of the time of all of them.
+        # Only changed cells and their neighbours: for a head's 720,000 cells a fifth of the time of all.
         _fill_gains(gains, dual, labels, np.flatnonzero(is_stale))
         is_stale[:] = False
         active = np.flatnonzero(gains > LEAST_GAIN * dual.size)
@@ -369,7 +369,7 @@ def _voxels(dual: Dual, cell: int, label: int) -> float:
 
 @unit
 def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
-    """The part of the energy that a cell's label decides, less what it is at best, if its label were this."""
+    """The part of the energy that depends on a cell's label, for this label, minus its least possible value."""
     price = -_voxels(dual, cell, label) - dual.bias[label] * dual.size[cell]
     for k in range(dual.across.shape[1]):
         other = dual.across[cell, k]
@@ -383,7 +383,7 @@ def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
 
 @helper
 def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
-    """Of the labels of a cell's neighbours the one of least price, and what is gained by it; its own if nothing is."""
+    """The cheapest label among a cell's neighbours, and its gain; the cell's own label if nothing is gained."""
     own = _price(dual, labels, cell, labels[cell])
     best, gain = labels[cell], 0.0
     for k in range(dual.across.shape[1]):
@@ -405,9 +405,9 @@ def _fill_gains(gains: Floats1, dual: Dual, labels: Ints1, stale: Ints1) -> None
 def _settle_once(
     dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: Ints1, is_stale: Bools1, is_careful: bool
 ) -> int:
-    """The cells of `order` take the best label of a neighbour one after the other, where that gains still.
+    """Let the cells of `order` take the best label of a neighbour one after the other, if that still gains.
 
-    Those that do, and the cells beside them, are marked in `is_stale`.
+    Changed cells and their neighbours are marked in `is_stale`.
     """
     moved = 0
     for cell in order:
@@ -438,10 +438,10 @@ def _settle_once(
 def keeps_topology(
     cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int, label: int
 ) -> bool:
-    """Whether a cell may have another label without changing the topology of its own label or of the new one.
+    """True if a cell may get another label without changing the topology of its own label or the new one.
 
-    A simple point in a complex of simplices: of either label, what the cell shares with its other cells and what it
-    shares with all that is not of it, the outside among them, are discs. Pinches are topology, too.
+    This is a simple point in a complex of simplices: for either label, the cell's contacts with the label's other cells
+    and with everything else including the outside are discs. Pinches are topology, too.
     """
     rest = (cells, across, labels, star_start, star_cells, cell)
     old = labels[cell]
@@ -458,10 +458,10 @@ def _is_disc(
     cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int,
     label: int, is_of: bool,
 ) -> bool:  # fmt: skip
-    """Whether what a cell shares with the other cells of a label, or with those of others and the outside, is a disc.
+    """True if a cell's contact with the other cells of a label, or with other labels and the outside, is a disc.
 
-    It is a disc of facets if there is one of them and not all, and nothing else is shared. Facets opposite the corners
-    S cover all of the cell's surface but what contains all of S: only cells around the simplex S share more.
+    It is a disc of facets if some but not all facets are shared, and nothing else is. Facets opposite the corners S
+    cover the cell's surface except the faces that contain all of S: only cells around the simplex S share more.
     """
     n, first, n_shared = cells.shape[1], -1, 0
     is_shared = np.zeros(4, dtype=np.bool_)
@@ -482,13 +482,13 @@ def _is_disc(
         for k in range(n):  # the outside, beyond a facet that has all of S, too
             if not is_of and across[other, k] < 0 and not _is_opposite(cells, other, k, cell, is_shared):
                 return False
-    # The cell's own facets outside are shared already: none of them contains all of S.
+    # The cell's own boundary facets are shared already: none of them contains all of S.
     return True
 
 
 @helper
 def _has_corners(cells: NDArray, other: int, cell: int, is_one: NDArray) -> bool:
-    """Whether a cell has those corners of another one."""
+    """True if a cell has these corners of another one."""
     has_all = True
     for k in range(cells.shape[1]):
         has_all = has_all and (not is_one[k] or has_node(cells, other, cells[cell, k]))
@@ -497,7 +497,7 @@ def _has_corners(cells: NDArray, other: int, cell: int, is_one: NDArray) -> bool
 
 @helper
 def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray) -> bool:
-    """Whether facet k of a cell lies opposite one of those corners of another cell."""
+    """True if facet k of a cell lies opposite one of these corners of another cell."""
     is_opposite = False
     for m in range(cells.shape[1]):
         is_opposite = is_opposite or (is_one[m] and cells[cell, m] == cells[other, k])
@@ -507,17 +507,17 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
 def _without_fragments(
     dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], voxel: float, components: list[NDArray]
 ) -> int:
-    """Components of cells that no component of voxels justifies are bridged or go; how many cells took another label.
+    """Bridge or relabel components of cells that no component of voxels justifies; return the number of changed cells.
 
-    The components of a label are ranked by the voxels of it that they hold. The first stays, and each further one of
-    whose rank there is a component of voxels, not far smaller. The others are linked to one of the same label, or,
-    where that costs more than `BRIDGE_RATIO` of the voxels that are then lost, given to their neighbours cell by cell.
+    A label's components are ranked by the number of its voxels that they contain. The first stays, and each further one
+    if the component of voxels of the same rank is not far smaller. The others are linked to a component of the same
+    label or, if that costs more than `BRIDGE_RATIO` of the voxels lost otherwise, go to their neighbours cell by cell.
     """
     number, of_component = components_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     is_own = dual.row == labels[cell]
     content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_component))
-    # What a cell would hold of the best other label: at most so much is lost if it goes.
+    # Volume of the best other label in a cell: an upper limit of the loss if it goes.
     others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
     most = BRIDGE_RATIO * (content - np.bincount(number, others, len(of_component)))
     order = np.lexsort((np.arange(len(of_component)), -content, of_component))
@@ -533,11 +533,11 @@ def _without_fragments(
     start = np.searchsorted(number[sorted_cells], np.arange(len(of_component) + 1))
     for component in order[~np.array(stays)[order]]:
         own = sorted_cells[start[component] : start[component + 1]]
-        if (labels[own] != of_component[component]).any():  # another bridge goes over it
+        if (labels[own] != of_component[component]).any():  # another bridge crosses it
             continue
         count = _bridge(bridge, way, before, dual, labels, own, most[component])
         n_taken = np.bincount(labels[bridge[:count]], minlength=len(components))
-        if count > 0 and ((n_taken == 0) | (n_taken < n_of)).all():  # no label goes for it
+        if count > 0 and ((n_taken == 0) | (n_taken < n_of)).all():  # no label vanishes for it
             labels[bridge[:count]] = of_component[component]
             n_of -= n_taken
             n_of[of_component[component]] += count
@@ -551,10 +551,10 @@ def _without_fragments(
 def _bridge(
     bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints1, component: Ints1, most: float
 ) -> int:
-    """The cells by which a component is linked to another of its label at least cost, below `most`; how many there are.
+    """The cells that link a component to another one of its label at least cost, below `most`, and their number.
 
-    Dijkstra's shortest path: a step costs what it costs that its cell has the label, all others as they are. `way` is
-    infinite before and after.
+    Dijkstra's shortest path: the cost of a step is that of giving its cell the label, with all others unchanged. `way`
+    is infinite before and after.
     """
     label, end, count = labels[component[0]], -1, 0
     heap = [(0.0, component[0])]
@@ -593,7 +593,7 @@ def _bridge(
 
 @entry
 def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
-    """Loose cells take the label of least price among those of neighbours that are not, from the outside in."""
+    """Give loose cells the cheapest label among neighbours that are not loose, from the outside in."""
     total, moved = 0, 1
     while moved > 0:
         moved = 0
@@ -614,19 +614,19 @@ def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
     return total
 
 
-# What is not manifold, at an edge (a, b) or a node (a, -1), and how it is mended.
+# Places that are not manifold, an edge (a, b) or a node (a, -1), and their repair.
 
 
 class _Work(NamedTuple):
-    """Room for the kernels below."""
+    """Work space for the kernels below."""
 
     star: Ints1  # the cells around one node or edge
-    label: Ints1  # the labels that these have, each once
-    own: Ints1  # which of those each of them has
-    beside: Ints2  # where in the star the cells beyond its facets are: its length for the outside, -1 if not around it
-    root: Ints1  # of each of them, in the fan that it is in
-    place: Ints1  # (M,) where a cell is in the star; -1 in between
-    steps: Ints1  # (N,) between labels, at facets around the edge from one node to another; 0 in between
+    label: Ints1  # the distinct labels of these
+    own: Ints1  # index of each cell's label among those
+    beside: Ints2  # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
+    root: Ints1  # root of each cell in its fan
+    place: Ints1  # (M,) position of a cell in the star; -1 between calls
+    steps: Ints1  # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
 
 
 def _work(dual: Dual) -> _Work:
@@ -639,11 +639,11 @@ def _work(dual: Dual) -> _Work:
 def _nonmanifold(
     dual: Dual, labels: NDArray[np.int64], is_near: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and where two labels meet.
+    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and a mask of two-label ones.
 
-    All of them, or those with a node that is near.
+    All of them, or those with a node marked near.
     """
-    # As many as there can be; pages that are not written to take no room.
+    # The largest possible number; unwritten pages take no memory.
     faces = np.empty((len(dual.scale) + 6 * len(labels), 3), dtype=np.int64)
     is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
     faces = faces[: _find_nonmanifold(faces, dual, labels, is_near, _work(dual))].copy()
@@ -651,9 +651,9 @@ def _nonmanifold(
 
 
 def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64]) -> int:
-    """What is not manifold is mended where that lowers the energy; how many cells took another label.
+    """Mend places that are not manifold if that lowers the energy; return the number of changed cells.
 
-    Bridges stay, and no label goes below its volume `least`.
+    Bridges stay, and no label falls below its volume `least`.
     """
     total, moved, is_near = 0, 1, None
     room = np.bincount(labels, dual.size, len(least)) - least
@@ -665,7 +665,7 @@ def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_],
 
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
-    """What is left where two labels meet is mended even if a bridge goes by it."""
+    """Mend the remaining places between two labels, even if that removes a bridge."""
     faces, is_two = _nonmanifold(dual, labels)
     room = np.bincount(labels, dual.size, len(least)) - least
     is_bridge, is_near = np.zeros(len(labels), dtype=bool), np.zeros(len(dual.scale), dtype=bool)
@@ -674,7 +674,7 @@ def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64
 
 @entry
 def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, work: _Work) -> int:
-    """The rows of `_nonmanifold` and the number of labels that meet there, (F, 3); their count."""
+    """Write the rows of `_nonmanifold` and the number of labels that meet there, (F, 3); return their count."""
     count, is_around = 0, _around(dual, is_near)
     for a in range(len(is_around)):
         if not is_around[a]:
@@ -705,7 +705,7 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
 
 @helper
 def _around(dual: Dual, is_near: NDArray) -> NDArray:
-    """Whether a cell around each node has a node that is near."""
+    """True for each node with a cell that has a node marked near."""
     is_around = np.zeros(len(is_near), dtype=np.bool_)
     for node in range(len(is_near)):
         for r in range(dual.star_start[node], dual.star_start[node + 1] if is_near[node] else 0):
@@ -716,10 +716,10 @@ def _around(dual: Dual, is_near: NDArray) -> NDArray:
 
 @helper
 def _count_steps(dual: Dual, labels: NDArray, a: int, steps: NDArray) -> None:
-    """Add to `steps` of each node b how many facets around the edge (a, b) lie between labels, from either side.
+    """Add to `steps` of each node b the number of facets around the edge (a, b) between labels, from either side.
 
-    A facet outside counts once more, one between labels that are apart as many as are doubtful: with less than
-    `DOUBTFUL_STEPS` labels are one fan each, and need no `_fault`: so that finding faults takes a fifth of the time.
+    A boundary facet counts once more, a facet between labels that are apart as many as are doubtful. With fewer than
+    `DOUBTFUL_STEPS`, labels are one fan each and need no `_fault`, so that finding faults takes a fifth of the time.
     """
     for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
         cell = dual.star_cells[r]
@@ -735,7 +735,7 @@ def _count_steps(dual: Dual, labels: NDArray, a: int, steps: NDArray) -> None:
 
 @helper
 def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
-    """The cells around a node, or around an edge with b >= 0, and how many they are."""
+    """Write the cells around a node, or around an edge if b >= 0, to `star`; return their number."""
     count = 0
     for r in range(dual.star_start[a], dual.star_start[a + 1]):
         if b < 0 or has_node(dual.cells, dual.star_cells[r], b):
@@ -746,9 +746,9 @@ def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
 
 @unit
 def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[float, int]:
-    """What is wrong at a node or an edge, in volumes of the cells around it: pinches, and false contact.
+    """Penalty for pinches and false contact at a node or an edge, in volumes of the cells around it.
 
-    The number of labels there comes second; with false contact, which is no matter of manifolds, three or more.
+    Also returns the number of labels there; three or more with false contact, which is not a question of manifolds.
     """
     count = _gather(dual, a, b, work.star)
     n_labels = _tell_apart(labels, count, work)
@@ -764,7 +764,7 @@ def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[floa
 
 @helper
 def _tell_apart(labels: NDArray, count: int, work: _Work) -> int:
-    """How many labels the cells of a star have; which, and which of them each cell has, is noted."""
+    """Number of labels of the cells of a star; also store these labels, and the label of each cell."""
     n_labels, own = 0, 0
     for i in range(count):
         label = labels[work.star[i]]
@@ -781,9 +781,9 @@ def _tell_apart(labels: NDArray, count: int, work: _Work) -> int:
 
 @helper
 def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: int, work: _Work) -> int:
-    """How many fans too many there are around a node or an edge, over all labels there.
+    """Number of excess fans around a node or an edge, over all labels there.
 
-    For each label, the fans of its cells less one and those of all others, the outside among them, less one.
+    For each label, the fans of its cells minus one, plus those of all others including the outside minus one.
     """
     steps, n_outer = 0, 0
     for i in range(count if b >= 0 else 0):
@@ -792,10 +792,10 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: i
                 other = dual.across[work.star[i], k]
                 n_outer += other < 0
                 steps += other >= 0 and labels[other] != labels[work.star[i]]
-    if b >= 0 and n_outer <= 2:  # a ring of cells, or one that the outside closes: each of its arcs is a fan
+    if b >= 0 and n_outer <= 2:  # a ring of cells, possibly closed by the outside: each of its arcs is a fan
         return steps + n_outer - 2 * n_labels
     is_open, excess = _link(dual, a, b, count, work), 0
-    if n_labels == 2 and not is_open:  # what is not of the one label is of the other
+    if n_labels == 2 and not is_open:  # cells without the one label have the other
         return 2 * (_fans(dual, count, 0, is_open, work) - 2)
     for own in range(n_labels):
         excess += _fans(dual, count, own, is_open, work) - 2
@@ -804,7 +804,7 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: i
 
 @helper
 def _link(dual: Dual, a: int, b: int, count: int, work: _Work) -> bool:
-    """Note where in a star the cells beyond its facets are; whether one of them is outside."""
+    """Store the positions in a star of the cells beyond its facets; return True if one is outside."""
     is_open = False
     for i in range(count):
         work.place[work.star[i]] = i
@@ -822,7 +822,7 @@ def _link(dual: Dual, a: int, b: int, count: int, work: _Work) -> bool:
 
 @helper
 def _has_false_contact(dual: Dual, count: int, n_labels: int, work: _Work) -> bool:
-    """Whether labels of some cells meet that the voxels of all these cells keep apart."""
+    """True if labels of some cells meet that are separate in the voxels of all these cells."""
     is_false = False
     for i in range(n_labels):
         for j in range(i):
@@ -834,7 +834,7 @@ def _has_false_contact(dual: Dual, count: int, n_labels: int, work: _Work) -> bo
 
 @helper
 def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
-    """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
+    """Fans of a label's cells in a star and of all others including the outside, linked by facets around it."""
     root, n_fans = work.root, count  # the last of the roots is the outside's
     for i in range(count + 1):
         root[i] = i
@@ -858,9 +858,9 @@ def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
 def _mend(
     dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, work: _Work
 ) -> int:
-    """Each face that is not manifold takes the move that lowers the energy with what is not manifold most.
+    """At each place that is not manifold, make the move that most lowers the energy including pinches.
 
-    Nodes of cells that changed are marked in `is_near`.
+    Nodes of changed cells are marked in `is_near`.
     """
     total, star, group = 0, np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
@@ -891,7 +891,7 @@ def _mend(
 
 @unit
 def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group: Ints1) -> int:
-    """Cells that may change together: cell i of a star; for i beyond these, the fan of one label that it begins."""
+    """Cells that may change together: cell i of a star, or for larger i the fan of one label that starts there."""
     if i < len(star):
         group[0] = star[i]
         return 1
@@ -911,7 +911,7 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
                 group[count] = other
                 count += 1
             if other < first:
-                return 0  # another cell begins it
+                return 0  # it starts with another cell
     return count if count > 1 else 0
 
 
@@ -919,7 +919,7 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
 def _best_of_group(
     dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, work: _Work
 ) -> tuple[int, float]:
-    """The label in the star that lowers the energy most if the group takes it, and the change: below `least`, or -1."""
+    """The label in the star that lowers the energy most for the group, and the change: below `least`, or -1."""
     old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
     before, pinches = 0.0, 0.0
     for j in range(len(star)):
@@ -935,7 +935,7 @@ def _best_of_group(
         for cell in group:
             labels[cell] = new
         change = _prices(dual, labels, group) - before - pinches
-        if change < least:  # with all pinches gone
+        if change < least:  # if all pinches vanish
             change += _pinches(dual, labels, faces, change, least, work)
         for cell in group:
             labels[cell] = old
@@ -946,7 +946,7 @@ def _best_of_group(
 
 @helper
 def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
-    """Whether a cell of a label lies across a facet of the group."""
+    """True if a cell of a label lies across a facet of the group."""
     for cell in group:
         for k in range(dual.across.shape[1]):
             if dual.across[cell, k] >= 0 and labels[dual.across[cell, k]] == label:
@@ -956,7 +956,7 @@ def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
 
 @helper
 def _closure(dual: Dual, group: NDArray) -> NDArray:
-    """Nodes (a, -1) and, in 3-D, edges (a, b) of some cells, each once, (F, 2)."""
+    """Distinct nodes (a, -1) and, in 3-D, edges (a, b) of some cells, (F, 2)."""
     n = dual.cells.shape[1]
     faces, count = np.empty((len(group) * (n + n * (n - 1) // 2), 2), dtype=np.int64), 0
     for cell in group:
@@ -975,7 +975,7 @@ def _closure(dual: Dual, group: NDArray) -> NDArray:
 
 @helper
 def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
-    """The part of the energy that the label of a group of cells, one for all, decides."""
+    """The part of the energy that depends on the common label of a group of cells."""
     total = 0.0
     for cell in group:
         total += _price(dual, labels, cell, labels[cell])
@@ -984,7 +984,7 @@ def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
 
 @unit
 def _pinches(dual: Dual, labels: Ints1, faces: Ints2, others: float, most: float, work: _Work) -> float:
-    """What these nodes and edges cost that are not manifold; or less, where that and the others' are `most` or more."""
+    """Penalty of these nodes and edges if not manifold; a lower bound once it and the others' reach `most`."""
     total = 0.0
     for f in range(len(faces)):
         total += _fault(dual, labels, faces[f, 0], faces[f, 1], work)[0] * dual.scale[faces[f, 0]]

@@ -1,4 +1,4 @@
-"""What both engines share: the history of a run, its clock, which nodes may move, and how far they moved."""
+"""Common parts of both engines: history and clock of a run, and the freedom and movement of nodes."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tetopt.image import Image, transformed
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 
-# The defaults of every way in, and their evidence (docs/measured/k_d.md, docs/understand/sizes.md).
-UNIFORM_K_D = 0.2  # nearly all that the displacement gains by the image, at hardly any cost in shape
+# The defaults of all entry points, with their evidence (docs/measured/k_d.md, docs/understand/sizes.md).
+UNIFORM_K_D = 0.2  # nearly all of the image's benefit for the displacement, at hardly any cost in shape
 UNIFORM_ITERATIONS = 20  # sweeps over all nodes, as in the paper's figures
 GRADED_K_D = 0.85  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho 0.255
 GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
-# A mesh that follows the image already has a small E_D to be measured by. With 0.02 pytetwild's of MNI152 and of a CT
-# get better in E_D, mean and 1st percentile of rho and smallest angle alike; with 0.05 MNI152's 165 slivers become 552.
+# A mesh that follows the image already has a small initial E_D. With 0.02 pytetwild's meshes of MNI152 and of a CT
+# improve in E_D, mean and 1st percentile of rho and smallest angle; with 0.05 MNI152's 165 slivers become 552.
 START_K_D = 0.02
-SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the minimum at the uniform k_D
+SHAPE_POWER = 3.0  # p: from 3 the energy itself keeps angles above the minimum at the uniform k_D
 MIN_DIHEDRAL = 12.0  # degrees: the smallest dihedral angle of a cell
-# The longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are seven times fewer
-# cells, and the displacement suffers sooner from those that grow where the image is uniform.
+# Longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are seven times fewer cells,
+# and the displacement suffers sooner from large ones where the image is uniform.
 QUADRATIC_RATIO = 1.15
-QUADRATIC_GRADATION = 0.5  # of sizes, likewise: gentler changes lower the displacement's error and the interfaces'
-# What a run that is over has left to lift flat cells: a part of the time that it took, and at least so much. Without
-# this bound slabs of 575 voxels took 27 to 200 s where one was asked for.
+QUADRATIC_GRADATION = 0.5  # of sizes, also for order 2: gentler changes lower errors of displacement and interfaces
+# Time for lifting flat cells after the time limit: a fraction of the run's time, and at least this. Without the bound
+# slabs of 575 voxels took 27 to 200 s for a limit of one.
 GRACE_FRACTION, GRACE_SECONDS = 0.1, 0.5
-E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
+E_D_ROUNDING = 1e-12  # of the image's variance x volume: a smaller E_D is rounding
 
 Boundary = Literal["slide", "fixed"]
 
@@ -47,23 +47,23 @@ class IterationRecord(NamedTuple):
     Parameters
     ----------
     iteration : int
-        From 0, the initial mesh.
+        Number of the iteration; 0 is the initial mesh.
     E : float
-        Normalised by the initial mesh, Eq. (4) and Section 4.
+        Energy normalised by the initial mesh, Eq. (4) and Section 4.
     E_G : float
-        mm^(n+2).
+        Geometric energy, mm^(n+2).
     E_D : float
-        intensity^2 mm^n.
+        Discretization energy, intensity^2 mm^n.
     movement : float
-        `|x^t - x^(t-1)| / |x^(t-1)|`, x from the box's centre.
+        `|x^t - x^(t-1)| / |x^(t-1)|`, with x from the box's centre.
     is_retessellated : bool
-        A new tessellation was taken in this iteration.
+        True if the connectivity changed in this iteration.
     n_cells : int
-        Triangles or tetrahedra.
+        Number of triangles or tetrahedra.
     n_voxels : int
-        Voxel centres inside the cells; the same in every row.
+        Number of voxel centres inside the cells; the same in every row.
     seconds : float
-        Since the run began.
+        Time since the run began.
 
     Examples
     --------
@@ -86,45 +86,45 @@ class IterationRecord(NamedTuple):
 
 
 class Whole(NamedTuple):
-    """What a part of a mesh takes over from the whole: where it lies in it, and what it is measured by."""
+    """Properties of the whole mesh for a part: the part's position, and the whole's normalisation."""
 
-    start: tuple[int, ...]  # the voxel of the whole image with which that of the part begins, by axis
-    shape: tuple[int, ...]  # of the whole image
-    bits: int  # of its sampling grid
+    start: tuple[int, ...]  # first voxel of the part's image in the whole image, by axis
+    shape: tuple[int, ...]  # shape of the whole image
+    bits: int  # bits of its sampling grid
     E_G: float  # shape energy of the initial mesh
-    squares: float  # its sum of squares, in the unit of the content's values
-    noise: float  # variance of the image's noise, likewise
+    squares: float  # its sum of squares, in squared units of the content's values
+    noise: float  # variance of the image's noise, in the same unit
 
 
 class MeshingResult(NamedTuple):
-    """What `optimize` returns, and, with all fields, `mesh_image`.
+    """Result of `optimize` and, with all fields, of `mesh_image`.
 
     Parameters
     ----------
     mesh : Mesh
-        The result.
+        The optimised mesh.
     history : list of Record
-        A row an iteration, the initial mesh's first.
+        One row per iteration, starting with the initial mesh.
     ended : {"iterations", "converged", "max_seconds", "stopped"}
         Why the run ended.
     initial : Mesh
         The mesh that the run began with.
     nodes : int, optional
-        The number that the run was to have, asked for or what a target error takes.
+        The requested number of nodes, or the number for the target error.
     seconds_start : float
-        For initial meshes, over all runs towards a target error.
+        Time for initial meshes, over all runs towards a target error.
     seconds_run : float
-        For the optimisations, likewise.
+        Time for optimisations, over all runs.
     labels : (M,) int64, optional
-        Label of each cell, of a content with memberships.
+        Label of each cell, for a content with memberships.
     violated : mapping of str to str
-        The requirements that the mesh violates, by name, a sentence each (`tetopt.engine.requirements`); empty if none.
+        Requirements that the mesh violates, by name, one sentence each (`tetopt.engine.requirements`); empty if none.
     fraction : float, optional
-        Of the content's variance, that is left in the cells: E_D over variance times volume. Of `mesh_image` alone.
+        Unexplained fraction of the content's variance: E_D over variance times volume. Only from `mesh_image`.
     n_dropped : int
-        Connected components that were left out of the mesh, since the mask does not have them.
+        Connected components that were dropped, since the mask does not have them.
     curving : Curving, optional
-        Of order 2, with a mask or smooth labels: how many edges there have their mid-edge node on the smooth level.
+        For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the smooth level.
 
     Examples
     --------
@@ -150,17 +150,17 @@ class MeshingResult(NamedTuple):
     curving: Curving | None = None
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
-        """Show the mesh in 3-D by pyvista, as `Mesh.plot` does; by default in the colours of its labels, if it has any.
+        """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its labels, if any.
 
-        A label has the colour of its number, as in all pictures and files; ``plot(result.labels, cmap="tab20")`` takes
-        a colour map instead.
+        A label has the colour of its number, as in all pictures and files; ``plot(result.labels, cmap="tab20")`` uses a
+        colour map instead.
 
         Parameters
         ----------
         values : (M,) or (N,) array, optional
-            A number for each cell, or else each node, that colours it.
+            A number for each cell, or for each node, to colour the mesh by.
         **options
-            Further ones of `Mesh.plot`.
+            Further options of `Mesh.plot`.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class MeshingResult(NamedTuple):
         Raises
         ------
         InputError
-            As `Mesh.plot`.
+            As for `Mesh.plot`.
 
         Examples
         --------
@@ -185,7 +185,7 @@ class MeshingResult(NamedTuple):
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""
         last, mesh = self.history[-1], self.mesh
-        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is left within cells"
+        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is unexplained"
         rows = [
             ("E", f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations ({self.ended})"),
             ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{fraction}"),
@@ -197,7 +197,7 @@ class MeshingResult(NamedTuple):
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
-    """A function that tells whether the time is over, or `stop` says so."""
+    """Make a function that returns True once the time is over or `stop` returns True."""
 
     def is_over() -> bool:
         if max_seconds is not None and time.perf_counter() - begin > max_seconds:
@@ -208,7 +208,7 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 
 def grace(begin: float, is_over: Callable[[], bool]) -> Callable[[], bool]:
-    """A function that tells whether a tenth of a run's time, or half a second, has gone by since the run was over."""
+    """Make a function that returns True a tenth of a run's time, or half a second, after the run was over."""
     ended: list[float] = []
 
     def is_late() -> bool:
@@ -227,9 +227,9 @@ def frozen_axes(
     """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
 
     A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
-    facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
-    surface on which such nodes slide, is marked in the last column. `facets_out` (B, n) are the boundary's facets,
-    `sides` (3, 2) the box's, in ticks.
+    facet off the box's faces keeps all coordinates, like every boundary node with "fixed"; with a surface on which such
+    nodes slide, it is marked in the last column instead. `facets_out` (B, n) are the boundary's facets, `sides` (3, 2)
+    the box's sides, in ticks.
     """
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
     if boundary == "fixed":
@@ -244,7 +244,7 @@ def frozen_axes(
 
 
 def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
-    """InputError for an option of both engines out of range."""
+    """Raise InputError for a common option of both engines out of range."""
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
     if iterations < 0:
@@ -254,9 +254,9 @@ def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
 
 
 def side_ticks(grid: SamplingGrid, whole: Whole | None = None) -> NDArray[np.int64]:
-    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), where they are whole numbers; a slice is one voxel thick.
+    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), which are whole numbers; a slice is one voxel thick.
 
-    With `whole` the sides of its box, as the part counts ticks.
+    With `whole`, the sides of its box in the part's ticks.
     """
     half = 1 << (grid.bits - 1)
     if whole is None:
@@ -273,7 +273,7 @@ def relative_movement(
     grid: SamplingGrid,
     matrix: NDArray[np.float64],
 ) -> float:
-    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
+    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, with x from the box's centre; Fig. 1(c)."""
     centre = np.array([(s - 1) * 0.5 for s in grid.shape]) * 2.0**grid.bits
     moved = transformed((after - before).astype(np.float64), matrix)
     place = transformed(before - centre, matrix)

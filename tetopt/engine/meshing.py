@@ -1,9 +1,9 @@
-"""The front door: from an image to an optimised mesh, whatever the mesh begins with and which engine moves it.
+"""The main entry point: from an image to an optimised mesh, for all initial meshes and engines.
 
-graded   an octree of the image's content, then the fast engine with nodes exchanged
+graded   an octree of the image's content, then the fast engine with exchanges of nodes
 uniform  a lattice, then the fast engine
 paper    a lattice, then the paper's scheme
-start    a mesh of the user's own, improved by the fast engine within its boundary
+start    the user's mesh, improved by the fast engine within its boundary
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from tetopt.start.sizes import Sizes
 from tetopt.system.budget import check_memory
 
 Mode = Literal["graded", "uniform", "paper", "start"]
-Run = Callable[..., MeshingResult]  # an optimisation that is ready to begin; takes further options of `optimize`
+Run = Callable[..., MeshingResult]  # an optimisation ready to start; takes further options of `optimize`
 
 
 class ModeDefaults(NamedTuple):
@@ -63,21 +63,21 @@ MODE_DEFAULTS: dict[Mode, ModeDefaults] = {
     "paper": ModeDefaults(UNIFORM_K_D, UNIFORM_ITERATIONS),
     "start": ModeDefaults(START_K_D, UNIFORM_ITERATIONS, "fixed"),
 }
-MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run begins with
+MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the initial mesh
     "graded": ("nodes", "target_error", "sizes"),
     "uniform": ("nodes", "spacing", "kind"),
     "paper": ("nodes", "spacing", "kind"),
     "start": ("start",),
 }
-QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # of order 2 to a corner, by dimension: of graded meshes of the MNI152 T1
-NODES_NEAR = 0.01  # of the number of nodes of order 2: a run that is so near is taken
-NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second mostly meets it
-FIRST_NODES = {2: 200, 3: 1500}  # of the first run towards an error, by dimension: so few that it takes no time
+QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
+NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
+NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
+FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
 ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000 nodes
-ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
+ERROR_REACHED = 0.85  # of the target error: a run from here up to the target ends the search
 CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 ERROR_RUNS = 6  # towards an error, at most
-SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh has left no time
+SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
 
 
 def mesh_image(
@@ -96,70 +96,69 @@ def mesh_image(
     watch: Callable[[Mesh, Run], MeshingResult] | None = None,
     **options: Any,
 ) -> MeshingResult:
-    """A mesh of the image's box with its nodes where the image has content; or a uniform one, or yours made better.
+    """Mesh an image's box with nodes where the image has detail; or make a uniform mesh, or improve yours.
 
     Parameters
     ----------
     image : Image or Content
-        The intensities h; or several contrasts, labels, a mask, within which alone there will be cells
+        The intensities h; or a content with several contrasts, labels and a mask that limits the mesh
         (`tetopt.content`).
     nodes : int
-        Number of nodes, of order 2 with those in the middle of edges. A graded mesh meets it (of order 2 to 1 %) unless
-        the run is cut short, k_D is 0, cells have to be lifted above the minimum dihedral angle, or no more nodes can
-        be taken out; count them. Without it and `target_error`, as many as `sizes` take that have a target everywhere.
+        Number of nodes, for order 2 including mid-edge nodes. A graded mesh meets it (to 1 % for order 2) unless the
+        run is cut short, k_D is 0, cells must be lifted above the minimum dihedral angle, or no more nodes can be
+        removed. Without `nodes` and `target_error`, the number follows from `sizes` with a target everywhere.
     target_error : float
-        Instead of `nodes`, of a graded mesh: the fraction of the image's variance that may be left within cells, 0 to
-        1; as many nodes as that takes, found in a few runs. A run that ends above it says so in `violated`.
+        Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0 to 1. A few runs find
+        the required number of nodes. `violated` reports a run that ends above the target.
     mode : {"graded", "uniform", "paper", "start"}
-        "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`, cut
-        off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box.
-        "start", the default with a mesh to start from: `optimize` of that.
+        "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`,
+        clipped at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`, for a single image without
+        labels or mask. "start", the default if `start` is given: `optimize` on that mesh.
     start : Mesh
-        The mesh to improve. Its boundary stays as it is, unless `boundary="slide"`.
+        The mesh to improve. Its boundary stays unchanged, unless `boundary="slide"`.
     spacing : float
-        Instead of `nodes`, of a lattice: edge length of a block, mm.
+        Instead of `nodes`, for a lattice: edge length of a block, mm.
     kind : str
-        Of the lattice, as of `tetopt.lattice_mesh`.
+        Kind of lattice, as for `tetopt.lattice_mesh`.
     k_D : float
-        Weight of the image; by default 0.85 on a graded mesh, 0.2 on a uniform one, 0.02 on one to start from. On a
-        graded mesh cells of all sizes share the shape energy, and the octree that normalises E_D has a small one
-        already, so that more of it than on a uniform mesh is usual.
+        Weight of the image; by default 0.85 for a graded mesh, 0.2 for a uniform one, 0.02 with `start`. On a graded
+        mesh, cells of all sizes share the shape energy, and the octree that normalises E_D already has a small E_D, so
+        larger weights than on a uniform mesh are usual.
     iterations : int
-        As of `optimize`, by default 16 on a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
+        As for `optimize`, by default 16 for a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
     sizes : Sizes
         Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
         order 2 up to 1.15 times with a gradation of 0.5.
     order : {1, 2}
-        Of the cells that the mesh is for (`tetopt.geometry.quadratic`). With 2 `nodes` counts mid-edge nodes, too:
-        about a seventh of them are the mesh's own (a quarter in 2-D), as many as up to three runs find. With a mask or
-        smooth labels the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (`curving` counts them).
+        Intended order of the cells (`tetopt.geometry.quadratic`). With 2, `nodes` includes mid-edge nodes: about a
+        seventh of the nodes are corners (a quarter in 2-D), whose number takes up to three runs to find. With a mask or
+        smooth labels, the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (see `curving`).
     watch : callable
-        Called for each run with its initial mesh and a function that does it; returns the run's result. It may set up
-        what watches a run: `lambda initial, run: run(callback=print)`.
+        Called for each run with its initial mesh and a function that does the run; returns the run's result. It may
+        pass a callback: `lambda initial, run: run(callback=print)`.
     **options
-        Further ones of `optimize` or `optimize_paper`. `max_seconds` is counted from the call on, over all runs.
+        Further options of `optimize` or `optimize_paper`. `max_seconds` counts from the call, over all runs.
 
     Returns
     -------
     MeshingResult
-        As `optimize`; its first record is of the initial mesh, which it holds, too. A run that could not keep all that
-        its requirements are returns its mesh nevertheless, and says so in `violated`: empty if it did, else a sentence
-        by name (`min_dihedral`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see
-        `tetopt.engine.requirements`).
+        As for `optimize`; its first record is that of the initial mesh, which it contains, too. A run that does not
+        meet all requirements still returns its mesh, and `violated` has a sentence for each violated one, by name
+        (`min_dihedral`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see `tetopt.engine.requirements`).
 
     Raises
     ------
     InputError
-        As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
-        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree_mesh`), or that there
-        is no memory for; an error that its noise does not allow.
+        As for `optimize` or `optimize_paper`; options that do not apply to the mode; neither or both of `nodes` and
+        `target_error`, or of `nodes` and `spacing`; a number of nodes that exceeds the image's detail (see
+        `octree_mesh`) or the memory; or an error below the image's noise.
     TypeError
-        An option of another name.
+        An unknown option.
 
     See Also
     --------
-    content : Several contrasts, labels and a mask.
-    save_mesh, build_model : What follows.
+    content : Combine several contrasts, labels and a mask.
+    save_mesh, build_model : Use the mesh.
 
     Examples
     --------
@@ -170,13 +169,13 @@ def mesh_image(
     >>> len(result.mesh.points), dict(result.violated), ratio > 100
     (300, {}, True)
 
-    As many nodes as an error takes, here a fifth of the image's variance:
+    Find the nodes for an error, here a fifth of the image's variance:
 
     >>> result = tetopt.mesh_image(image, target_error=0.2, iterations=4)
     >>> print(f"{tetopt.E_D(image, result.mesh) / (image.data.var() * image.volume):.2f}")
     0.14
 
-    A mesh of yours, made better:
+    Improve an existing mesh:
 
     >>> result = tetopt.mesh_image(image, start=tetopt.lattice_mesh(image, nodes=300), iterations=3)
     >>> result.history[-1].E < 1
@@ -194,7 +193,7 @@ def mesh_image(
     _check_mode(mode, content, values | {"sizes": sizes}, order)
     options = _with_defaults(mode, options, k_D=k_D, iterations=iterations)
     sizes = sizes_of_order(content, nodes, sizes, order) if mode == "graded" else sizes
-    if order == 2 and content.smooth is not None:  # curved edges cut nothing off: corners are on the surface, too
+    if order == 2 and content.smooth is not None:  # curved edges cut nothing off, so corners lie on the surface, too
         content = content._replace(smooth=content.smooth._replace(band=0.0))
     seconds: list[float] = []
 
@@ -216,7 +215,7 @@ def mesh_image(
 
     def begun(corners: int | None) -> MeshingResult:
         if mode == "graded":
-            # The longest edge of order 2 may leave no octree near to so few corners: exchanges take out what they can.
+            # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as many as they can.
             return run((octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes), corners)
         return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
 
@@ -235,20 +234,20 @@ def mesh_image(
 
 
 def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
-    """The `max_seconds` of a run, which are those of all runs and of what they begin with, if they are limited."""
+    """The remaining `max_seconds` for a run, if time is limited, out of that for all runs and initial meshes."""
     if options.get("max_seconds") is None:
         return {}
     return {"max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)}
 
 
 def _curved(result: MeshingResult, content: Content) -> MeshingResult:
-    """The result with the mid-edge nodes of interfaces and of a mask's surface on the smooth levels."""
+    """Move the mid-edge nodes of interfaces and of a mask's surface onto the smooth levels."""
     mesh, curving = curved(result.mesh, content, result.labels)
     return result._replace(mesh=mesh, curving=curving)
 
 
 def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:
-    """An initial mesh without what is carved off within a mask, and how many connected components were dropped."""
+    """Carve an initial mesh within a mask; also return the number of dropped connected components."""
     if content.region is None:
         return initial, 0
     carving = carved(initial, content.image, content.region, content.keeps_components)
@@ -256,32 +255,32 @@ def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:
 
 
 def bytes_of(content: Content, nodes: int) -> float:
-    """What meshing a content with so many nodes takes besides what there is; see `tetopt.engine.cost.meshing_bytes`."""
+    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.engine.cost.meshing_bytes`."""
     image = content.image
     return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
 
 
 def check_target_error(target_error: float) -> None:
-    """InputError for an error that is no fraction."""
+    """Raise InputError unless the target error is a fraction."""
     if not 0.0 < target_error < 1.0:
         raise InputError(f"target_error: expected a fraction of the image's variance, 0 to 1, got {target_error}")
 
 
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
-    """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
+    """Raise InputError for more nodes than fit into memory, or into `limit` bytes in total."""
     shape = " x ".join(map(str, content.image.shape))
     what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
-    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or allow more", limit)
-    check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
+    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or raise the memory limit", limit)
+    check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "use fewer nodes", limit)
 
 
 def _with_defaults(mode: Mode, options: dict[str, Any], **stated: Any) -> dict[str, Any]:
-    """The options of an optimisation and those that are stated, not None; else the defaults of the mode."""
+    """The options of an optimisation, including stated ones that are not None; else the defaults of the mode."""
     return MODE_DEFAULTS[mode]._asdict() | options | {name: each for name, each in stated.items() if each is not None}
 
 
 def _check_names(options: dict[str, Any], optimisation: Run) -> None:
-    """TypeError, as of Python's own calls, for options that neither `mesh_image` nor the optimisation takes."""
+    """Raise TypeError, like Python's own calls, for options unknown to `mesh_image` and the optimisation."""
     known = inspect.signature(optimisation).parameters
     for name in options:
         if name not in known:
@@ -291,7 +290,7 @@ def _check_names(options: dict[str, Any], optimisation: Run) -> None:
 
 
 def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
-    """As many nodes, of order 2 in all, as the sizes take if they say so everywhere."""
+    """Number of nodes, including mid-edge ones for order 2, if sizes have targets everywhere; else None."""
     needed, fraction = nodes_of_sizes(content, sizes)
     if fraction < 1.0:
         return None
@@ -301,9 +300,9 @@ def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
 def with_label_sizes(
     sizes: Sizes, content: Content, nodes: int | None, order: int
 ) -> tuple[Sizes, SizesByLabel | None]:
-    """The sizes with targets by place for those by label, and what labels get if there are any.
+    """Convert sizes by label to targets by place; also return the labels' sizes, if any.
 
-    `nodes` are those of the mesh, of order 2 with those in the middle of edges.
+    `nodes` is the mesh's number, for order 2 including mid-edge nodes.
     """
     many = QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0
     made = sizes_by_label(sizes, content, None if nodes is None else round(nodes / many))
@@ -311,27 +310,27 @@ def with_label_sizes(
 
 
 def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int) -> None:
-    """InputError for a mode that there is not, and for what does not belong to it."""
+    """Raise InputError for an unknown mode, and for arguments that do not apply to it."""
     if mode not in MODE_DEFAULTS:
-        raise InputError(f"mesh_image: expected a mode of {', '.join(MODE_DEFAULTS)}, got {mode!r}")
+        raise InputError(f"mesh_image: expected mode {', '.join(MODE_DEFAULTS)}, got {mode!r}")
     if order not in (1, 2):
         raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     names = [name for name, value in values.items() if value is not None]
     if unknown := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])
-        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {takes}, but no {unknown[0]}")
+        raise InputError(f"mesh_image: mode {mode!r} takes {takes}, not {unknown[0]}")
     if mode == "graded" and ("nodes" in names) == ("target_error" in names):
-        raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
+        raise InputError("mesh_image: give exactly one of nodes and target_error")
     if mode in ("uniform", "paper") and ("nodes" in names) == ("spacing" in names):
-        raise InputError("mesh_image: give a number of nodes or a spacing, one of them")
+        raise InputError("mesh_image: give exactly one of nodes and spacing")
     if mode == "start" and not names:
-        raise InputError("mesh_image: mode 'start' needs a mesh to start from")
+        raise InputError("mesh_image: mode 'start' requires a mesh to start from")
     if mode == "paper" and not (content.is_plain and content.region is None):
-        raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
+        raise InputError("mesh_image: the paper's scheme takes one image, without labels or mask")
 
 
 def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
-    """The limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 the longest edge, too."""
+    """Limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 including the longest edge."""
     if order == 1:
         return sizes
     sizes = Sizes() if sizes is None else sizes
@@ -346,9 +345,9 @@ def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, ord
 
 
 def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) -> MeshingResult:
-    """Run after run with other numbers of corners, until corners and midpoints of edges together are `nodes`.
+    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are `nodes`.
 
-    The result of the run that is nearest, or of one that was cut short.
+    Returns the result of the nearest run, or of one that was cut short.
     """
     corners, ratio = 0, QUADRATIC_NODES[ndim]
     nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more whole meshes are kept
@@ -369,37 +368,37 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
 def meshed_to_error(
     image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], MeshingResult]
 ) -> MeshingResult:
-    """Run after run with other numbers of nodes, until the fraction of the image's variance is just below a target.
+    """Repeat runs with other numbers of nodes until the unexplained variance is just below a target.
 
-    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that has the error; if
-    none has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from
-    the start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried, nor than targets of
-    sizes take.
+    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
+    if none does, of the run with the least error, or of one that was cut short. It is the same as with that number of
+    nodes from the start, unless limits on sizes forbid it. At least 2^(n + 2) nodes are tried, and at least as many as
+    targets of sizes take.
 
     Raises
     ------
     InputError
-        A fraction out of range, or one below that of the image's noise, which no mesh should follow; as `octree_mesh`.
+        A fraction out of range, or below that of the image's noise, which no mesh should follow; as for `octree_mesh`.
     """
     check_target_error(target_error)
     content = plain(image)
     variance = content.variance
     if variance == 0.0:
-        raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
+        raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
     noise = content.noise * content.unit / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's fraction, by estimate {noise:.3g}: "
-            "cells would have to follow the noise; ask for more, or denoise the image"
+            f"target_error: {target_error:g} of the variance is below the noise's fraction, estimated as {noise:.3g}, "
+            "so cells would have to follow the noise; use a larger fraction, or denoise the image"
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
-    nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
+    nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # unexplained variance by number of nodes
     best: list[MeshingResult] = []  # the one so far: no more whole meshes are kept
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
         nodes = max(nodes, fewest)
         initial = nearest_octree(content, nodes, sizes)
-        # Limits on sizes may ask for more nodes than the error, or allow fewer; a mask's octree is near only roughly.
+        # Limits on sizes may require more nodes than the error, or allow fewer; a mask's octree is only roughly near.
         if content.region is None and not is_near(len(initial.points), nodes):
             nodes = len(initial.points)
         if nodes in requests:
@@ -423,18 +422,18 @@ def meshed_to_error(
 
 
 def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:
-    """Whether one number of nodes answers better than another: it has the error with fewer, or is nearer to it."""
+    """True if a number of nodes is better than another: it meets the target with fewer, or is nearer to it."""
     if (fractions[new] <= target) != (fractions[old] <= target):
         return fractions[new] <= target
     return new < old if fractions[new] <= target else fractions[new] < fractions[old]
 
 
 def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int:
-    """The number of nodes to try next: between the nearest two on either side, or beyond the nearest."""
+    """The number of nodes to try next: between the nearest ones on either side, or beyond the nearest."""
     aim = 0.5 * (1.0 + ERROR_REACHED) * target
     above = max((n for n, fraction in fractions.items() if fraction > target), default=None)
     below = min((n for n, fraction in fractions.items() if fraction <= target), default=None)
-    least = 0.03 * aim  # there may be no error at all
+    least = 0.03 * aim  # the error may be 0
     if above is not None and below is not None and above < below:
         part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
         return int(above * (below / above) ** part)

@@ -57,9 +57,9 @@ def optimize_paper(
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> MeshingResult:
-    """Move the nodes of a mesh to lower E, by the paper's scheme.
+    """Move the nodes of a mesh to lower E by the paper's scheme.
 
-    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial mesh.
 
     Parameters
     ----------
@@ -69,39 +69,39 @@ def optimize_paper(
         The initial mesh, which also normalises the two energies; for re-tessellation it must fill the image's
         box, as `tetopt.start.lattice.lattice_mesh` does.
     k_D : float
-        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation),
-        else by descent with numerical derivatives.
+        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation);
+        otherwise it moves by descent with numerical derivatives.
     iterations : int
-        Number of sweeps over all nodes, at most.
+        Maximum number of sweeps over all nodes.
     n_t : int, optional
-        Re-tessellation happens in the first n_t iterations only. Default: all for k_D = 0, else half.
+        Number of first iterations with re-tessellation. Default: all for k_D = 0, else half.
     retessellate : {"first", "accept", "never"}
-        Take every Delaunay tessellation of the first n_t iterations; in all iterations those that lower E
-        (Section 4); or none.
+        "first": accept every Delaunay tessellation of the first n_t iterations. "accept": in all iterations, accept
+        those that lower E (Section 4). "never": keep the connectivity.
     boundary : {"slide", "fixed"}
-        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+        Boundary nodes move within the box's faces and edges, or not at all. Those off the box are fixed.
     step_ratio : float
         Step of the numerical derivative over the distance to the nearest cell centroid.
     tolerance : float
-        Converged when the relative movement of an iteration falls below it.
+        The run has converged if the relative movement of an iteration falls below this.
     max_seconds : float, optional
         Stop at the next colour of nodes after this time; the mesh is valid.
     callback : callable, optional
         Called with each `IterationRecord`.
     stop : callable, optional
-        Asked between colours of nodes (several times a second on common meshes); True ends the run there.
+        Called between colours of nodes (several times a second on common meshes); True ends the run.
 
     Returns
     -------
     MeshingResult
-        Mesh, history and why it ended. The mesh covers the same domain and every cell is positively oriented.
-        With the connectivity fixed E never rises, beyond rounding, from one record to the next.
+        Mesh, history and reason for the end. The mesh covers the same domain and every cell is positively oriented.
+        With fixed connectivity, E never rises between records, except by rounding.
 
     Raises
     ------
     InputError
-        An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with cells that overlap at a
-        facet, or, unless `retessellate` is "never", one that does not fill the image's box.
+        An option out of range; a mesh that is invalid for sampling (see `cell_moments`) or has cells that overlap at a
+        facet; or, unless `retessellate` is "never", a mesh that does not fill the image's box.
 
     See Also
     --------
@@ -138,7 +138,7 @@ def optimize_paper(
     record(0, 0.0, False)
     ended = "iterations"
     for iteration in range(1, iterations + 1):
-        # 1. Connect the nodes anew.
+        # 1. Reconnect the nodes.
         is_new = False
         if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
             candidate = _retessellated(image, grid, state)
@@ -150,7 +150,7 @@ def optimize_paper(
         before = state.complex.ticks.copy()
         is_finished = _sweep(state, step_ratio, k_D, is_over)
         # 3. Measure.
-        if state.objective.image == 0.0:  # moves did not look at the voxels
+        if state.objective.image == 0.0:  # moves did not update the sums
             state.complex.sums[: len(_cells(state))] = moment_sums(grid, state.complex.ticks, _cells(state))
         movement = relative_movement(before, state.complex.ticks, image, grid, state.objective.matrix)
         record(iteration, movement, is_new)
@@ -170,7 +170,7 @@ def _cells(state: State) -> NDArray[np.int64]:
 
 
 def default_n_t(k_D: float, iterations: int) -> int:
-    """Number of first iterations that connect the nodes anew: all for k_D = 0 (Lloyd's alternation), else half."""
+    """Number of first iterations that reconnect the nodes: all for k_D = 0 (Lloyd's alternation), else half."""
     return iterations if k_D == 0.0 else (iterations + 1) // 2
 
 
@@ -187,13 +187,13 @@ def _check_options(
 
 
 def _check_fills_box(image: Image, mesh: Mesh) -> None:
-    """Delaunay fills the convex hull of the nodes: InputError for a mesh whose domain is not the image's box."""
+    """Raise InputError unless the mesh fills the image's box, as Delaunay fills the convex hull of the nodes."""
     index = image.to_index(mesh.points)
     extent = np.column_stack([index.min(axis=0), index.max(axis=0)])
     is_box = np.abs(extent - box_sides(image.shape)).max() <= ON_SIDE_VOXELS
     if not is_box or abs(filled_fraction(mesh, image) - 1.0) > 1e-9:
         raise InputError(
-            "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
+            "mesh: re-tessellation requires a mesh that fills the image's box exactly, as a lattice does; "
             'pass retessellate="never" to keep the connectivity'
         )
 
@@ -209,7 +209,7 @@ def _initial(image: Image, mesh: Mesh, grid: SamplingGrid, k_D: float, boundary:
 
 
 def _with_E_G(state: State, image: Image, grid: SamplingGrid) -> State:
-    """The state with E_G of its cells as `tetopt.energy.geometric` has it."""
+    """The state with E_G of its cells as in `tetopt.energy.geometric`."""
     points, cells = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim)), _cells(state)
     state.complex.E_shape[: len(cells)] = cell_E_G(points, cells)
     return state
@@ -223,10 +223,10 @@ def _energies(state: State, image: Image) -> tuple[float, float]:
 
 
 def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
-    """The state with Delaunay's cells; None where they would not be a mesh of the same box.
+    """The state with Delaunay cells; None if they are not a mesh of the same box.
 
-    Checked exactly: every cell oriented on the fixed-point grid, every facet between two cells or on the box, and
-    every voxel in one cell; and no cell is flat.
+    The checks are exact: every cell is oriented on the fixed-point grid, every facet lies between two cells or on the
+    box, every voxel is in one cell, and no cell is flat.
     """
     mesh = state.complex
     cells = delaunay(from_ticks(mesh.ticks, grid, image.ndim), image.affine)
@@ -245,7 +245,7 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
 
 
 def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bool]) -> bool:
-    """Move every node once; False if `is_over` cut it short, between two colours."""
+    """Move every node once; return False if `is_over` cut it short, between two colours."""
     stars, cells = node_stars(state), _cells(state)
     colours = greedy_colours(cells, stars.start, stars.cells)
     is_free = ~state.complex.is_frozen[:, 4 - cells.shape[1] : 3].all(axis=1)

@@ -20,11 +20,11 @@ from tetopt.engine.surface import projection_at
 from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
 from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 
-LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the star's energy: then the node stays
+LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the star's energy, before the node stays
 
 
 class Moves(NamedTuple):
-    """The nodes of one colour, and what their moves read and write."""
+    """The nodes of one colour, and inputs and outputs of their moves."""
 
     state: State
     stars: NodeStars
@@ -35,20 +35,20 @@ class Moves(NamedTuple):
 def descend(moves: Moves) -> None:
     """Move nodes along the image's axes to lower the energy of their stars (Section 2.2).
 
-    Per axis the star's energy is measured at one step forwards and backwards, the step a ratio of the distance to
-    the nearest centroid of the star's cells; the vertex of the parabola through the three values is tried as well;
-    the best of them is taken if it lies below the present energy.
+    For each axis the star's energy is measured one step forwards and backwards, where the step is a fraction of the
+    distance to the nearest centroid of the star's cells, and at the vertex of the parabola through the three values.
+    The node moves to the best of these if that lowers the energy.
     """
     with few_threads(len(moves.nodes) * 100):
         run(_descend, len(moves.nodes), moves)
 
 
 def relocate(moves: Moves) -> None:
-    """Move nodes to the minimisers of E_G over their stars (Section 2.1), the objective's weights being 1 and 0.
+    """Move nodes to the minimisers of E_G over their stars (Section 2.1), with weights 1 and 0 in the objective.
 
-    Inside, that is the volume-weighted mean of the star's circumcentres. A node on a face or an edge of the box
-    goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
-    times, then left out. Sums and fluxes are not kept up.
+    Inside, this is the volume-weighted mean of the star's circumcentres. A node on a face or an edge of the box moves
+    to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four times, then
+    skipped. Sums and fluxes are not updated.
     """
     with few_threads(len(moves.nodes) * 10):
         run(_relocate, len(moves.nodes), moves)
@@ -56,7 +56,7 @@ def relocate(moves: Moves) -> None:
 
 @helper
 def _load_cell(x: NDArray, state: State, cell: int) -> None:
-    """A cell's corners in mm from the middle of the first voxel, to x (4, 3)."""
+    """Write a cell's corners, mm from the middle of the first voxel, to x (4, 3)."""
     mesh, objective = state.complex, state.objective
     for k in range(mesh.cells.shape[1]):
         place = scaled(2.0**-objective.bits, row(mesh.ticks, mesh.cells[cell, k]))
@@ -77,12 +77,12 @@ def _shape(x: NDArray, state: State, cell: int) -> float:
 
 @unit
 def _star_energy(trial: TrialByValue, limit: float, node: int, state: State, stars: NodeStars) -> float:
-    """Energy of a node's star as the ticks stand; what is measured goes to `trial`.
+    """Energy of a node's star at the current ticks; measured values are written to `trial`.
 
-    Infinite if a cell is flat or inverted, or once the energy is above `limit`.
+    It is infinite if a cell is flat or inverted, or once the energy exceeds `limit`.
     """
     first, energy = stars.start[node], 0.0
-    for r in range(first, stars.start[node + 1]):  # cheap refusals before any voxel is read
+    for r in range(first, stars.start[node + 1]):  # cheap rejections before any voxel is read
         trial.shapes[r - first] = _shape(trial.x, state, stars.cells[r])
         if trial.shapes[r - first] == np.inf:
             return np.inf
@@ -117,7 +117,7 @@ def _descend(moves: Moves, number: int) -> None:
     node, state, stars = moves.nodes[number], moves.state, moves.stars
     ticks, matrix, fluxes = state.complex.ticks, state.objective.matrix, state.complex.fluxes
     size, x = stars.start[node + 1] - stars.start[node], np.empty((4, 3))
-    # Two trials: the best so far is in row `kept`, the next goes to the other.
+    # Two trials: the best so far is in row `kept`, the next is written to the other.
     shapes, sides, kept = np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2])), 0
     energy = 0.0
     for r in range(stars.start[node], stars.start[node + 1]):
@@ -134,7 +134,7 @@ def _descend(moves: Moves, number: int) -> None:
         for attempt in range(3):
             if attempt < 2:  # the numerical derivative: one step forwards, one backwards
                 there = here + step * (1 - 2 * attempt)
-                limit = np.inf  # the parabola needs both values whole
+                limit = np.inf  # the parabola needs both values in full
             else:  # the vertex of the parabola through the three values
                 bend = forwards + backwards - 2.0 * energy
                 if not (np.isfinite(bend) and bend > 0.0):
@@ -160,7 +160,7 @@ def _descend(moves: Moves, number: int) -> None:
 
 @unit
 def _relocate(moves: Moves, number: int) -> None:
-    """Move one node to the minimiser of its star's E_G, or as far towards it as no cell is inverted."""
+    """Move one node to the minimiser of its star's E_G, or as far towards it as no cell inverts."""
     node, state, stars = moves.nodes[number], moves.state, moves.stars
     ticks, n_corners, trial = state.complex.ticks, state.complex.cells.shape[1], trial_of(state, stars, node)
     weight, gradient, energy, star_volume = 1.0 / (n_corners * (n_corners + 1)), np.zeros(3), 0.0, 0.0

@@ -1,8 +1,8 @@
-"""The minimum dihedral angle: the worst cells mended one by one, whatever it does to E.
+"""Enforce the minimum dihedral angle: mend the worst cells one by one, regardless of E.
 
-Moves are those of `tetopt.engine.flips` and `tetopt.engine.density` and displacements of single nodes, but judged
-by the smallest dihedral angle of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch
-1997), and of the moves of a cell the one that leaves the best worst angle, up to the minimum.
+Moves are those of `tetopt.engine.flips` and `tetopt.engine.density` and displacements of single nodes, but their
+measure is the smallest dihedral angle of the affected cells: a move is made only if that grows (Freitag and
+Ollivier-Gooch 1997), and each cell takes the move that leaves the best worst angle, up to the minimum.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
 from tetopt.system.kernels import Floats1, Floats2, Ints1, entry, helper, unit
 
-REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
-DISPLACED_AT_ONCE = 200  # cells between two questions whether time is over: up to 0.1 s, of 0.4 ms each
+REPAIR_ROUNDS = 40  # at most; a round without changes ends them earlier
+DISPLACED_AT_ONCE = 200  # cells between two checks of the time: up to 0.1 s, at 0.4 ms each
 STEP_HALVINGS = 7  # of a node's displacement
 FIRST_STEP_EDGES = 0.25  # of the star's mean edge: the first displacement
-WORST_WEIGHT = 40.0  # a steep sum stands for the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
+WORST_WEIGHT = 40.0  # a steep sum approximates the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
 
 
 class Repaired(NamedTuple):
-    """What `repair` returns."""
+    """Result of `repair`."""
 
     state: State
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
@@ -79,8 +79,8 @@ def _fill_cosines(cosines: Floats1, state: State) -> None:
 def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lambda: False) -> Repaired:
     """Lift every cell's smallest dihedral angle to `min_dihedral`, degrees, as far as moves can.
 
-    Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
-    put in or taken out; until no cell is left, a round changes nothing, or `is_over` says so.
+    Each round treats the cells below, the worst first: by flips, then by displacements of their nodes and, if neither
+    helps, by inserting or removing nodes. Rounds end when no cell remains, nothing changes, or `is_over` returns True.
     """
     target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
@@ -99,7 +99,7 @@ def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lamb
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)
-        if n_made == 0 and len(bad):  # nodes between labels may leave the surfaces that they lie on
+        if n_made == 0 and len(bad):  # nodes between labels may leave their surfaces
             n_made = _displaced(_released(state), bad, target, is_over)
         n_moves += n_made
         if n_made == 0:
@@ -108,7 +108,7 @@ def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lamb
 
 
 def _displaced(state: State, bad: NDArray[np.int64], target: float, is_over: Callable[[], bool]) -> int:
-    """`_displace` until `is_over` says so: tens of thousands of cells far below voxels took minutes."""
+    """`_displace` until `is_over` returns True, as tens of thousands of cells far smaller than voxels took minutes."""
     stars, n_made = node_stars(state), 0
     for begin in range(0, len(bad), DISPLACED_AT_ONCE):
         if is_over():
@@ -118,12 +118,12 @@ def _displaced(state: State, bad: NDArray[np.int64], target: float, is_over: Cal
 
 
 def _released(state: State) -> State:
-    """The state in which nodes between labels slide on no surface; those on a mask's still do."""
+    """The state in which nodes between labels are off their surfaces; those on a mask's surface still slide on it."""
     return state._replace(complex=state.complex._replace(meeting=np.full_like(state.complex.meeting, -1)))
 
 
 def n_cells_below(state: State, min_dihedral: float) -> int:
-    """How many cells have a smallest dihedral angle under `min_dihedral` degrees."""
+    """Number of cells with a dihedral angle below `min_dihedral` degrees."""
     return int((cell_cosines(state) < -np.cos(np.radians(min_dihedral))).sum())
 
 
@@ -135,7 +135,7 @@ def _worst_first(state: State, target: float) -> NDArray[np.int64]:
 
 @entry
 def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
-    """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
+    """For each bad cell make the flip that leaves the best worst angle in its cavity, if it improves."""
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
     is_changed = np.zeros(room, dtype=np.bool_)
@@ -181,7 +181,7 @@ def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
 
 @unit
 def _gain_of_face(x: Floats2, state: State, cell: int, k: int, target: float) -> float:
-    """By how much the worst angle of the cavity (its minus cosine, up to the target) grows in a face flip."""
+    """Growth of the cavity's worst angle (its negative cosine, up to the target) by a face flip."""
     cells, across = state.complex.cells, state.complex.across
     other = across[cell, k]
     old = min(cell_cosine(x, state, cell), cell_cosine(x, state, other))
@@ -197,7 +197,7 @@ def _gain_of_face(x: Floats2, state: State, cell: int, k: int, target: float) ->
 
 @unit
 def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open: int, target: float) -> float:
-    """The same for the removal of an edge; `work.apex` holds the triangulation."""
+    """Growth of the worst angle by removing an edge; `work.apex` holds the triangulation."""
     cells = state.complex.cells
     x, ring, around, cost, apex, shape = work.x, work.ring, work.around, work.cost, work.apex, work.triangle
     a, b = cells[cell, TET_EDGES[e, 0]], cells[cell, TET_EDGES[e, 1]]
@@ -251,7 +251,7 @@ def _displace(state: State, stars: NodeStars, bad: Ints1, target: float) -> int:
 
 @unit
 def _star_cosine(x: Floats2, state: State, stars: NodeStars, node: int, least: float) -> float:
-    """The worst of a star's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
+    """Worst cosine of a star's cells; -2 if one is flat or inverted, or some value below `least` if it falls below."""
     worst = 1.0
     for r in range(stars.start[node], stars.start[node + 1]):
         c = state.complex.cells[stars.cells[r]]
@@ -286,7 +286,7 @@ def _lift(x: Floats2, state: State, stars: NodeStars, node: int, target: float) 
 
 @helper
 def _first_step(x: NDArray, state: State, stars: NodeStars, node: int) -> float:
-    """A quarter of the mean length of the edges from a node, each as often as cells have it, mm."""
+    """A quarter of the mean length of the edges from a node, each counted once per cell, mm."""
     total, count = 0.0, 0
     for r in range(stars.start[node], stars.start[node + 1]):
         load_cell(x, state.complex.ticks, state.complex.cells, stars.cells[r], state.objective)
@@ -303,7 +303,7 @@ def _first_step(x: NDArray, state: State, stars: NodeStars, node: int) -> float:
 def _step_around(
     x: Floats2, normal: Floats2, is_sliding: bool, state: State, stars: NodeStars, node: int, step: float, best: float
 ) -> float:
-    """Move a node by a step, mm, in the one of 26 directions that leaves its star's best cosine; that, or `best`."""
+    """Move a node by a step, mm, in the best of 26 directions for its star's cosine; return that, or `best`."""
     t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits
     here = row(t, node)
     there = here

@@ -1,7 +1,7 @@
-"""The requirements of a mesh, measured on the mesh itself, whatever the engine believes of it.
+"""The requirements of a mesh, measured on the mesh itself, independently of the engine.
 
-A run that ends in time returns a mesh even where it could not meet them all; its result says which it violates, and the
-command line ends with 1 there.
+A run that ends in time returns a mesh even if it does not meet them all; its result lists those that it violates, and
+the command exits with status 1.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 
-MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
-LABEL_VOXELS = 200  # a label of more may not be without cells
-ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below that which the kernels kept in ticks
-VOLUME_ROUNDING = 1e-9  # relative: the volume of cells that fill the box exactly, summed up
+MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
+LABEL_VOXELS = 200  # a label with more voxels must have cells
+ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
+VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
 BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
-BOUNDARY_ROUNDING = 1e-6  # relative: likewise of cells within a boundary in the user's own digits
+BOUNDARY_ROUNDING = 1e-6  # relative: the same within a boundary with the user's digits
 
 
 def checked(result: MeshingResult, content: Content, min_dihedral: float, start: Mesh) -> MeshingResult:
-    """The result of a run with the requirements that its mesh violates, each in a sentence.
+    """Add the requirements that a run's mesh violates to its result, each as a sentence.
 
     Parameters
     ----------
     result : MeshingResult
-        The run; of it mesh, history and labels are asked.
+        The result of the run, of which mesh, history and labels are used.
     content : Content
         What the mesh represents.
     min_dihedral : float
@@ -50,13 +50,13 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
     Returns
     -------
     MeshingResult
-        With `violated`, empty if there is nothing. `min_dihedral`: cells with a smaller dihedral angle, of tetrahedra
-        that were moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or
-        volume of the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a
-        Dice with the mask below 0.9, and `components`: more connected components than the mask has. `manifold`: edges
-        or nodes at which the boundary, within a mask, or the interface of two labels is not a manifold. `labels`:
-        labels of more than 200 voxels that no cell has. A requirement that could not be checked, for want of memory,
-        counts as violated, with the reason: the mesh is not lost for it.
+        With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral angle, if the run
+        moved any nodes. `box`: nodes farther beyond the image's box than the initial mesh's. `cover`: voxels or volume
+        lost or gained relative to the initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
+        two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask.
+        `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
+        manifold. `labels`: labels of more than 200 voxels without cells. A requirement that cannot be checked, for lack
+        of memory, counts as violated, with the reason, and the mesh is kept.
     """
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
     if content.region is not None:
@@ -83,14 +83,14 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
 
 
 def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[str, str]:
-    """Nodes beyond an image's box, further than those of an initial mesh, if there is one."""
+    """Nodes beyond an image's box, or farther beyond it than those of an initial mesh, if given."""
     beyond = float(beyond_box(mesh, image).max())
     allowed = 0.0 if start is None else max(float(beyond_box(start, image).max()), 0.0)
     return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed + ON_SIDE_VOXELS else {}
 
 
 def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
-    """As `checked`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
+    """Like `checked`, for a mesh that fills the box of an image, whose voxels need not be in memory."""
     violated = _violated_min_dihedral(result, min_dihedral) | _uncovered(grid, result) | violated_box(result.mesh, grid)
     return result._replace(violated=violated)
 
@@ -101,22 +101,23 @@ def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[s
         return {}
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
-    words = f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to {angles.min():.2f}"
-    return {"min_dihedral": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
+    words = f"{below} of {len(angles)} cells have a dihedral angle below {min_dihedral:g} degrees, down to "
+    words += f"{angles.min():.2f}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"
+    return {"min_dihedral": words} if below else {}
 
 
 def requested(result: MeshingResult, content: Content, target_error: float | None, is_filled: bool) -> MeshingResult:
-    """The result of a run with the requests to `mesh_image` that it does not meet, beside its requirements.
+    """Add requests to `mesh_image` that a run's result does not meet to its violated requirements.
 
-    `error`: more of the image's variance left in the cells than `target_error`. `cover`: if the mesh `is_filled`, which
-    the image's box should be, voxels or volume of that.
+    `error`: an unexplained variance above `target_error`. `cover`: uncovered voxels or volume, if the mesh should fill
+    the image's box (`is_filled`).
     """
     violated = dict(result.violated)
     fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
     if target_error is not None and fraction > target_error:
         violated["error"] = (
-            f"{fraction:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
-            "cells or more iterations, or ask for a number of nodes"
+            f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}; allow smaller "
+            "cells or more iterations, or give a number of nodes"
         )
     violated |= _uncovered(content.image, result) if is_filled else {}
     return result._replace(violated=violated, fraction=fraction)
@@ -126,7 +127,7 @@ def _uncovered(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
-    words = f"the mesh does not cover the image: {outside} voxels are outside, its volume is {volume:.9g} of "
+    words = f"the mesh does not cover the image: {outside} voxels are outside, and its volume is {volume:.9g} of "
     return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
 
 
@@ -135,7 +136,7 @@ def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     gained = result.history[-1].n_voxels - result.history[0].n_voxels
     if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
         return {}
-    words = f"the mesh no longer covers what it did: {gained:+d} voxels, its volume is {volume:.9g} of "
+    words = f"the mesh no longer covers its initial domain: {gained:+d} voxels, and its volume is {volume:.9g} of "
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
@@ -144,13 +145,13 @@ def _violated_mask(image: Image, region: Region, result: MeshingResult) -> dict[
     is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
         violated["overlap"] = (
-            f"cells overlap: together they hold {twice} voxels twice; allow more nodes, and please report this"
+            f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
         )
     dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
         violated["mask"] = (
-            f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
-            "allow more nodes"
+            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large for the mask's "
+            "detail; allow more nodes"
         )
     return violated
 
@@ -178,7 +179,7 @@ def _violated_labels(content: Content, result: MeshingResult) -> dict[str, str]:
     inside = members.partition[is_inside]
     counts = np.bincount(inside.ravel(), minlength=len(members.labels))
     is_large = counts > LABEL_VOXELS * members.parts
-    if content.region is not None:  # label 0 is the outside, too
+    if content.region is not None:  # label 0 includes the outside
         is_large &= members.labels > 0
     lost = [str(label) for label in members.labels[is_large] if label not in result.labels]
     if not lost:

@@ -1,14 +1,14 @@
-"""Moving nodes by Newton steps on the E of their stars, groups of one colour at a time.
+"""Move nodes by Newton steps on E of their stars, one colour of groups at a time.
 
-The shape energy's derivative is in closed form. That of E_D, connectivity fixed, needs only the facets around the
+The shape energy's derivative has a closed form. For fixed connectivity, that of E_D needs only the facets around the
 node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
-over their facets, phi_a the node's hat function and n the outward normal; hbar's own change drops out, because it is
-the minimiser. Two cells share a facet with opposite normals, so what counts is (h - hbar_j)^2 - (h - hbar_i)^2.
-The second derivative of the shape energy is exact; of E_D's it is the part in which h changes across the facets.
+over their facets, where phi_a is the node's hat function and n the outward normal; the change of hbar drops out,
+because hbar is the minimiser. Two cells share a facet with opposite normals, which leaves (h - hbar_j)^2 -
+(h - hbar_i)^2. The second derivative of the shape energy is exact; for E_D only the change of h across facets is used.
 
-Groups of nodes of one colour share no cell, so each is worked on, and its stars rewritten, at the same time as the
-others; the result does not depend on the threads. A move is made only if no cell of the star loses its orientation
-(exactly, in integers) and the star's measured energy falls, so E never rises.
+Groups of nodes of one colour share no cell, so they are processed, and their stars rewritten, in parallel; the result
+does not depend on the threads. A move is made only if no cell of the star loses its orientation (exactly, in integers)
+and the star's measured energy falls, so E never rises.
 """
 
 from __future__ import annotations
@@ -72,28 +72,28 @@ from tetopt.system.kernels import (
     unit,
 )
 
-FACET_PARTS = 8  # most parts that a facet's edge is cut into when h is integrated over it; four times as many in 2-D
-PART_VOXELS = 3.0  # voxels between the points at which h is then taken
-FACET_ASIDE = 0.25  # how far to either side of them: E falls by less per sweep at 0.05 as at 0.5
-BEND_FRACTION = 0.4  # of the image's own curvature: jumps of h end within voxels, and steps are longer than that
-FLAT_BEND = 1e-9  # a curvature's determinant over the product of its diagonal: below, it is nothing to divide by
-FIRST_STEP_FRACTION = 0.4  # of the distance to the nearest centroid of the star's cells: the longest first step
-AXIS_STEP_FRACTION = 0.1  # of that distance: how far a stalled node looks along the axes
-BLOCK_NODES = 128  # nodes in a group, at most: what they read fits the cache
-APPROACH_TRIALS = 4  # of the way to a surface: all of it, a half, ...
-LINE_TRIALS = 2  # energies measured along the step: a third gains a twentieth of what the axes do
+FACET_PARTS = 8  # most parts of a facet's edge for integrating h over it; four times as many in 2-D
+PART_VOXELS = 3.0  # voxels between the points of this integration
+FACET_ASIDE = 0.25  # distance to either side at which h is sampled: E falls by less per sweep at 0.05 and at 0.5
+BEND_FRACTION = 0.4  # of the image's curvature: jumps of h end within voxels, and steps are longer than that
+FLAT_BEND = 1e-9  # least determinant of a curvature over the product of its diagonal that allows division
+FIRST_STEP_FRACTION = 0.4  # longest first step, of the distance to the nearest centroid of the star's cells
+AXIS_STEP_FRACTION = 0.1  # of that distance: search step of a stalled node along the axes
+BLOCK_NODES = 128  # nodes in a group, at most: their data fit into the cache
+APPROACH_TRIALS = 4  # fractions of the way to a surface: all of it, a half, ...
+LINE_TRIALS = 2  # energies measured along the step: a third one gains a twentieth of the search along the axes
 
 
 class Blocks(NamedTuple):
-    """Nodes in groups that lie together."""
+    """Groups of neighbouring nodes."""
 
-    nodes: Ints1  # (N,) one group after the other
-    start: Ints1  # (B+1,) where each begins
+    nodes: Ints1  # (N,) nodes, group by group
+    start: Ints1  # (B+1,) start of each group
     of_node: Ints1  # (N,) the group of each node
 
 
 def blocks(ticks: NDArray[np.int64]) -> Blocks:
-    """Groups of nodes along a Z-order curve (Morton 1966), so that a graded mesh gets groups of equal number."""
+    """Group nodes along a Z-order curve (Morton 1966), which gives equal groups on a graded mesh, too."""
     size = max(1, min(BLOCK_NODES, len(ticks) // 64))
     low, high = ticks.min(axis=0), ticks.max(axis=0)
     cell = (ticks - low) * 1023 // np.maximum(high - low, 1)
@@ -116,12 +116,12 @@ def sweep(
     is_over: Callable[[], bool] = lambda: False,
     gains: NDArray[np.float64] | None = None,
 ) -> bool:
-    """Move the nodes that may, `may_move` (N,), each along the axes, and on the surface, that `is_frozen` leaves it.
+    """Move the nodes in `may_move` (N,), each along the axes and on the surfaces that `is_frozen` allows.
 
-    By how much E falls with the move of each goes to `gains` (N,).
-    Groups of one colour share no cell, and are worked on at the same time, their nodes one after the other: those read
-    the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
-    `is_over` cut it short, between two colours.
+    The reduction of E by each move is written to `gains` (N,).
+    Groups of one colour share no cell and are processed in parallel, their nodes one after the other. These read the
+    same voxels from the cache, 1.5 to 2 times faster than nodes of one colour all over the volume. Returns False if
+    `is_over` cut the sweep short, between two colours.
     """
     gains = np.zeros(len(may_move)) if gains is None else gains
     laid_out = packed(state), packed(stars), packed(groups)
@@ -134,7 +134,7 @@ def sweep(
 
 
 def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[NDArray[np.int64]]:
-    """The groups of each colour: none shares a cell with another of its colour."""
+    """The groups of each colour; groups of one colour share no cell."""
     start, cells = _block_stars(groups.nodes, groups.start, stars.start, stars.cells)
     colours = greedy_colours(groups.of_node[state.complex.cells[: state.complex.n_cells[0]]], start, cells)
     return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
@@ -142,7 +142,7 @@ def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[NDArray[n
 
 @entry
 def _block_stars(nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints1) -> tuple[Ints1, Ints1]:
-    """The cells around the nodes of each group, as `Stars`; cells may be named several times."""
+    """The cells around the nodes of each group, as `Stars`; cells may occur several times."""
     first = np.zeros(len(start), dtype=np.int64)
     cells = np.empty(len(star_cells), dtype=np.int64)
     count = 0
@@ -156,7 +156,7 @@ def _block_stars(nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints
 
 
 def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of the two weighted terms of E by every node's position, (N, 3) each, per mm: shape and image."""
+    """Derivatives of the weighted shape and image terms of E by each node's position, (N, 3) each, per mm."""
     shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
     run(_gradients, len(shape), Gradients(shape, image, state, stars))
     return shape, image
@@ -166,11 +166,11 @@ def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArr
 def _facet_moments(
     moment: Floats2, ticks: Ints2, node: int, b: int, c: int, aside: tuple[float, float, float], objective: Objective
 ) -> float:
-    """Means of phi, h phi and phi^2 dh over the facet (node, b, c), or the segment (node, b), phi the hat function.
+    """Means of phi, h phi and phi^2 dh over the facet (node, b, c) or segment (node, b), with hat function phi.
 
-    h is the mean of the voxels `aside` of a place, to and from, in voxels, less the grid's shift, and dh what the one
-    is more than the other. moment (2, n_channels) gets the means of h phi and of phi^2 dh; that of phi is returned,
-    1/3 (1/2 in 2-D).
+    h is the mean of the values at a place plus and minus `aside`, in voxels, minus the grid's shift, and dh is their
+    difference. moment (2, n_channels) gets the means of h phi and of phi^2 dh; the mean of phi, 1/3 (1/2 in 2-D), is
+    returned.
     """
     if objective.volume.is_short:
         return _moments_of(moment, objective.volume.short, ticks, node, b, c, aside, objective)
@@ -230,8 +230,8 @@ def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: 
 def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, node: int) -> None:
     """Add the derivative of the weighted E_D by a node's position to g (3,), and its curvature to H (3, 3), per voxel.
 
-    As a facet moves by phi along its normal, the jump of (h - hbar)^2 over it changes as h does there. Like in a
-    Gauss-Newton step that is all of the curvature that is taken, and only where it is positive.
+    As a facet moves by phi along its normal, the jump of (h - hbar)^2 across it changes with h. As in a Gauss-Newton
+    step, only this part of the curvature is used, and only if it is positive.
     """
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
     n, first, scale = cells.shape[1], stars.start[node], 2.0**-objective.bits
@@ -241,7 +241,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
         for k in range(n):
             twin = stars.twin[r, k]
             if k == stars.corner[r] or twin < 0 or twin // n < r - first:
-                continue  # not a facet of the node; on the boundary, along which the node slides; or done
+                continue  # not a facet of the node, on the boundary, along which the node slides, or already done
             other = stars.cells[first + twin // n]
             label_1, label_2 = state.complex.labels[cell], state.complex.labels[other]
             if _has_same_values(sums, cell, other, label_1, label_2, objective):
@@ -258,7 +258,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
                 elif c == node:
                     b, c = a, b
             normal, area = scaled(float(objective.hand), normal), np.sqrt(dot(normal, normal))
-            moment = means if label_1 == label_2 else every  # cells of one label differ in their means alone
+            moment = means if label_1 == label_2 else every  # cells of one label differ only in their means
             weight = _facet_moments(moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective)
             jump, rise = 0.0, 0.0
             for channel in range(moment.shape[1]):
@@ -275,7 +275,7 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
 
 @helper
 def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2: int, objective: Objective) -> bool:
-    """Whether two cells have the same value in all channels, as those of the background, or one holds no voxel."""
+    """True if two cells have equal values in all channels, as in the background, or one contains no voxel."""
     count_1, count_2 = sums[cell, 0], sums[other, 0]
     if count_1 <= 0.0 or count_2 <= 0.0:
         return True
@@ -288,7 +288,7 @@ def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2
 
 @unit
 def _add_tension_gradient(g: Floats1, state: State, stars: NodeStars, node: int) -> None:
-    """Add the derivative of what the interfaces around a node cost to g (3,), per mm."""
+    """Add the derivative of the energy of interfaces around a node to g (3,), per mm."""
     mesh, objective = state.complex, state.objective
     for r in range(stars.start[node], stars.start[node + 1]):
         cell = stars.cells[r]
@@ -315,7 +315,7 @@ def _add_tension_gradient(g: Floats1, state: State, stars: NodeStars, node: int)
 
 @unit
 def star_tension(state: State, stars: NodeStars, node: int) -> float:
-    """What the interfaces around a node cost as the ticks stand."""
+    """Energy of the interfaces around a node at the current ticks."""
     mesh, total = state.complex, 0.0
     if not (state.objective.tension > 0.0 and mesh.meeting[node, 1] >= 0):
         return 0.0
@@ -336,8 +336,8 @@ def _add_shape_gradient(
 ) -> tuple[float, float]:
     """Add the weighted shape energy's derivatives to g (3,), per mm, and H (3, 3), per mm^2.
 
-    Returns the distance in mm to the nearest centroid of the star's cells, and the star's worst cosine, up to the angle
-    limit.
+    Returns the distance in mm to the nearest centroid of the star's cells, and the star's worst cosine, up to the
+    angle limit.
     """
     cells, objective = state.complex.cells, state.objective
     n, power = cells.shape[1], objective.power
@@ -377,7 +377,7 @@ def _volume_and_squares(x: NDArray, n_corners: int) -> tuple:
 
 
 class Gradients(NamedTuple):
-    """What `gradient` fills."""
+    """Inputs and outputs of `gradient`."""
 
     shape: Floats2  # (N, 3)
     image: Floats2  # (N, 3)
@@ -394,26 +394,26 @@ def _gradients(work: Gradients, node: int) -> None:
 
 
 class Trial(NamedTuple):
-    """What `star_energy` measures of a node's star of R cells."""
+    """Results of `star_energy` for a node's star of R cells."""
 
-    x: Floats2  # (4, 3) room for a cell's corners
-    shapes: Floats1  # (R,) shape energy of each cell; -1 if it is gone
-    fluxes: Floats3  # (R, n+1, D) of its facets around the node, outwards
+    x: Floats2  # (4, 3) space for a cell's corners
+    shapes: Floats1  # (R,) shape energy of each cell; -1 if it is removed
+    fluxes: Floats3  # (R, n+1, D) outward fluxes of its facets around the node
 
 
-TrialByValue = Annotated[Trial, by_value(Trial)]  # it is made by the kernels, several a move
+TrialByValue = Annotated[Trial, by_value(Trial)]  # made by the kernels, several per move
 
 
 @helper
 def trial_of(state: State, stars: NodeStars, node: int) -> Trial:
-    """Room for what is measured of a node's star."""
+    """Space for measurements of a node's star."""
     size, fluxes = stars.start[node + 1] - stars.start[node], state.complex.fluxes
     return Trial(np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2])))
 
 
 @inlined
 def star_misfit(state: State, stars: NodeStars, node: int) -> tuple:
-    """The star's weighted misfit to the mask before a move, times -1, and whether a move may change it."""
+    """Minus the star's weighted misfit to the mask before a move, and True if a move may change it."""
     misfit, has_misfit = 0.0, False
     if state.objective.surface > 0.0:
         for r in range(stars.start[node], stars.start[node + 1]):
@@ -427,10 +427,10 @@ def star_misfit(state: State, stars: NodeStars, node: int) -> tuple:
 def star_shape(
     trial: Trial, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
 ) -> float:
-    """Weighted shape energy of a node's star as the ticks stand; each cell's goes to `trial.shapes`.
+    """Weighted shape energy of a node's star at the current ticks; each cell's is written to `trial.shapes`.
 
-    Infinite if a cell is flat or inverted or has a cosine under `least`, or once the energy is above `limit`. Cells
-    that have the node `joined`, at whose place the node is, count as gone.
+    It is infinite if a cell is flat or inverted or has a cosine below `least`, or once the energy exceeds `limit`.
+    Cells with the node `joined`, at whose place the node is, count as removed.
     """
     cells, objective = state.complex.cells, state.objective
     has_limit = cells.shape[1] == 4 and least > -1.0
@@ -439,7 +439,7 @@ def star_shape(
         if joined >= 0 and has_node(cells, stars.cells[r], joined):
             trial.shapes[r - first] = -1.0
             continue
-        if has_limit:  # of tetrahedra; one determinant serves both questions
+        if has_limit:  # of tetrahedra; one determinant serves both checks
             load_cell(trial.x, state.complex.ticks, cells, stars.cells[r], objective)
             determinant, S = determinant_and_squares(trial.x)
             shape = tet_energy(determinant, S, objective.power, objective.is_graded)
@@ -459,10 +459,10 @@ def star_shape(
 def star_image(
     sums: NDArray, trial: Trial, energy: float, misfit: float, bound: float, node: int, state: State, stars: NodeStars
 ) -> tuple:
-    """Add the image's energy in a node's star as the ticks stand to `energy`, and what it has of the misfit to that.
+    """Add the image energy of a node's star at the current ticks to `energy`, and its misfit to the misfit.
 
-    Infinite once the energy is above `bound`. Fluxes go to `trial`, in whose `shapes` cells that are gone are
-    negative; `sums` (1, D) is room for those of a cell.
+    It is infinite once the energy exceeds `bound`. Fluxes are written to `trial`, whose `shapes` are negative for
+    removed cells; `sums` (1, D) is work space for a cell's sums.
     """
     cells, objective, shapes, fluxes = state.complex.cells, state.objective, trial.shapes, trial.fluxes
     n, D, first = cells.shape[1], fluxes.shape[2], stars.start[node]
@@ -497,13 +497,13 @@ def star_image(
 def star_energy(
     trial: TrialByValue, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
 ) -> float:
-    """Energy of a node's star as the ticks stand, all that was measured in `trial`; infinite as `star_shape`.
+    """Energy of a node's star at the current ticks, with details in `trial`; infinite as for `star_shape`.
 
-    What the star's misfit to the mask is more than it was is added.
+    It includes the growth of the star's misfit to the mask.
     """
     misfit, has_misfit = star_misfit(state, stars, node)
-    bound = np.inf if has_misfit else limit  # no sum says anything before all of the misfit is in it
-    energy = star_shape(trial, bound, least, node, state, stars, joined)  # cheap refusals before any voxel is read
+    bound = np.inf if has_misfit else limit  # partial sums are meaningless until they include all of the misfit
+    energy = star_shape(trial, bound, least, node, state, stars, joined)  # cheap rejections before any voxel is read
     if energy == np.inf or state.objective.image == 0.0:
         return energy
     sums = np.empty((1, trial.fluxes.shape[2]))
@@ -516,7 +516,7 @@ def star_energy(
 
 @unit
 def store(trial: TrialByValue, node: int, state: State, stars: NodeStars) -> None:
-    """Write what `star_energy` measured of a node's star into the complex."""
+    """Write the results of `star_energy` for a node's star to the complex."""
     first, fluxes = stars.start[node], state.complex.fluxes
     for r in range(first, stars.start[node + 1]):
         cell = stars.cells[r]
@@ -530,14 +530,14 @@ def store(trial: TrialByValue, node: int, state: State, stars: NodeStars) -> Non
 
 
 class Sweep(NamedTuple):
-    """The groups of one colour, whose nodes are to be moved."""
+    """The groups of one colour, whose nodes may move."""
 
     state: State
     stars: NodeStars
     groups: Blocks
     chosen: Ints1  # (G,) the groups
     may_move: Bools1  # (N,)
-    gains: Floats1  # (N,) by how much E falls with the move of each; none are kept of `attract`
+    gains: Floats1  # (N,) reduction of E by each node's move; unused by `attract`
 
 
 @unit
@@ -549,26 +549,26 @@ def _sweep(work: Sweep, number: int) -> None:
 
 
 class Search(NamedTuple):
-    """The best place of a node so far, and room for two trials: slot[0] is that of the best, the other the next."""
+    """The best place of a node so far, and space for two trials: slot[0] is the best, the other one the next."""
 
     x: NDArray[np.float64]  # (4, 3) room for a cell's corners
     normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.surface.normals_at`
-    is_sliding: bool  # whether the node stays on its surfaces
+    is_sliding: bool  # True if the node stays on its surfaces
     best: NDArray[np.float64]  # (1,) the least energy of the star
-    place: NDArray[np.int64]  # (1, 3) where that is, ticks
+    place: NDArray[np.int64]  # (1, 3) its place, ticks
     slot: NDArray[np.int64]  # (1,)
-    shapes: NDArray[np.float64]  # (2, R) as of `Trial`
+    shapes: NDArray[np.float64]  # (2, R) as in `Trial`
     fluxes: NDArray[np.float64]  # (2, R, n+1, D)
 
 
-# Its steps, and those of `star_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
-# inlined steps 3 to 8 % (MNI152 T1, 5,000 nodes, one thread).
+# Its steps and those of `star_energy` are inlined: compared with one long function, a sweep took 12 % longer with
+# calls, and 3 to 8 % longer with inlined steps (MNI152 T1, 5,000 nodes, one thread).
 @unit
 def _move(node: int, state: State, stars: NodeStars) -> float:
-    """Move one node towards the least energy of its star, if that lowers it; returns by how much."""
+    """Move one node towards the least energy of its star, if that lowers it; return the reduction."""
     ticks, fluxes, has_image = state.complex.ticks, state.complex.fluxes, state.objective.image > 0.0
     x, normal, g, H = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3), np.zeros((3, 3))
-    # A star with flat cells may stay as it is, but not get worse: hence the star's own `least`.
+    # A star with flat cells may stay as it is, but not get worse, hence its own `least`.
     nearest, least = _add_shape_gradient(g, H, x, state, stars, node)
     if has_image and state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
         _add_tension_gradient(g, state, stars, node)
@@ -606,7 +606,7 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
 
 @inlined
 def _turn_to_index(g: NDArray, H: NDArray, matrix: NDArray) -> None:
-    """Turn first and second derivatives per mm, g (3,) and H (3, 3), into those per index unit."""
+    """Convert first and second derivatives per mm, g (3,) and H (3, 3), to index units."""
     u, A = (g[0], g[1], g[2]), H.copy()
     for d in range(3):
         g[d] = matrix[0, d] * u[0] + matrix[1, d] * u[1] + matrix[2, d] * u[2]
@@ -619,7 +619,7 @@ def _turn_to_index(g: NDArray, H: NDArray, matrix: NDArray) -> None:
 
 @inlined
 def _per_mm(g: NDArray, state: State) -> tuple:
-    """Derivatives per index unit, g (3,), as those per mm."""
+    """Convert derivatives per index unit, g (3,), to mm."""
     M = state.sides.inverse
     return (
         M[0, 0] * g[0] + M[1, 0] * g[1] + M[2, 0] * g[2],
@@ -630,7 +630,7 @@ def _per_mm(g: NDArray, state: State) -> tuple:
 
 @helper
 def _newton_step(g: NDArray, H: NDArray, node: int, state: State) -> tuple:
-    """-H^-1 g over the axes along which a node may move; down the gradient where H is not positive. Index units.
+    """-H^-1 g, in index units, over the axes along which a node may move; down the gradient if H is not positive.
 
     The rows of the other axes are cleared.
     """
@@ -666,7 +666,7 @@ def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple
 def _try_place(
     search: Search, place: tuple, limit: float, least: float, node: int, state: State, stars: NodeStars
 ) -> float:
-    """Energy of the star with the node at a place, ticks, or on the surface beside it; the best is kept in mind."""
+    """Energy of the star with the node at a place, ticks, or on the surface beside it; the best place is stored."""
     put_row(state.complex.ticks, node, place)
     if search.is_sliding and not slid(search.normal, state, stars, node):
         return np.inf
@@ -682,9 +682,9 @@ def _try_place(
 def _search_line(
     search: Search, step: tuple, t: float, slope: float, least: float, node: int, state: State, stars: NodeStars
 ) -> None:
-    """Look t steps ahead, then where the parabola through what was measured has its vertex.
+    """Try the place t steps ahead, then the vertex of the parabola through the measured values.
 
-    `slope` is by how much E changes per step to begin with.
+    `slope` is the initial change of E per step.
     """
     energy, scale = search.best[0], 2.0**-state.objective.bits
     here = row(search.place, 0)
@@ -718,9 +718,9 @@ def _search_line(
 def _search_axes(
     search: Search, step: tuple, length: float, least: float, node: int, state: State, stars: NodeStars
 ) -> None:
-    """Look a length, mm, along each free axis in turn, where the step goes first, and go on from where E is lower.
+    """Search by a length, mm, along each free axis in turn, towards the step first, and continue where E is lower.
 
-    The gradient is of the continuous image, the energy of its voxels: a node may stall where this still lowers E.
+    The gradient is that of the continuous image, the energy that of its voxels: a stalled node may still lower E so.
     """
     M = state.objective.matrix
     for axis in range(4 - state.complex.cells.shape[1], 3):
@@ -744,18 +744,18 @@ def _search_axes(
 
 @unit
 def slid(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
-    """Bring a moved node back to its surfaces; whether it got there, and the mask's facets face as they should."""
+    """Return a moved node to its surfaces; True if it gets there and the mask's facets keep facing outwards."""
     is_there = put_on_surface(normal, state, node)
     return is_there and (not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1))
 
 
-# Nodes between labels are brought to the surface that they are to slide on.
+# Move nodes between labels onto the surface on which they will slide.
 
 
 def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) -> None:
-    """Move nodes between labels to where those meet, or as far as no cell is left flatter than `angle_limit`.
+    """Move nodes between labels onto their interfaces, or as far as no cell becomes flatter than `angle_limit`.
 
-    A cell that is flatter already may get no worse. E may rise. `angle_limit` is minus a cosine, as of an `Objective`.
+    A cell that is flatter already may not get worse. E may rise. `angle_limit` is minus a cosine, as in `Objective`.
     """
     lowered = state._replace(objective=state.objective._replace(angle_limit=angle_limit))
     is_between = state.complex.meeting[:, 1] >= 0

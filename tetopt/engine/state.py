@@ -1,4 +1,4 @@
-"""The one place where a state is made: what the kernels carry together, of a content and a mesh."""
+"""Construction of the state of a content and a mesh for the kernels."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ def state_of(
     content: Content, mesh: Mesh, grid: SamplingGrid, k_D: float, power: float = SHAPE_POWER,
     boundary: Boundary = "slide", is_graded: bool = False, whole: Whole | None = None,
 ) -> State:  # fmt: skip
-    """The state of an initial mesh, which normalises the two energies; no angle limit yet. `grid` is the content's.
+    """The state of an initial mesh, which normalises the two energies, without angle limit; `grid` is the content's.
 
-    A part of a mesh is normalised by the `whole`; what it shares with the rest stays as it is, node for node and facet
-    for facet, as boundary nodes beside the box's sides do.
+    A part of a mesh is normalised by the `whole`; nodes and facets that it shares with the rest stay unchanged, like
+    boundary nodes off the box's sides.
 
     Raises
     ------
     InputError
-        A mesh that the sampling cannot take, that is folded, or a cell too flat to have a shape energy; or energies
-        that overflow.
+        A mesh that is invalid for sampling, is folded or has a cell too flat for a shape energy; or energies that
+        overflow.
     """
     state = unweighted(content, mesh, grid, power, boundary, is_graded, whole)
     flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
     if len(flat):
         raise InputError(
-            f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
+            f"mesh: {len(flat)} cells are too flat to optimise, the first are {flat[:5].tolist()}; "
             "remove them or move their nodes apart"
         )
     E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
     weight = k_D / squares0 if squares0 > 0.0 else 0.0
     if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
-        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
+        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities in a usual range?")
     geometry, surface = float((1.0 - k_D) / E_G0), float(weight * state.objective.wrong_side)
     return weighted(state, geometry, float(weight), surface)
 
@@ -50,7 +50,7 @@ def unweighted(
     content: Content, mesh: Mesh, grid: SamplingGrid, power: float, boundary: Boundary, is_graded: bool = False,
     whole: Whole | None = None,
 ) -> State:  # fmt: skip
-    """The state of a mesh, both energies of weight 1. Raises InputError as `state_of`, but accepts flat cells."""
+    """The state of a mesh with weight 1 for both energies. Raise InputError like `state_of`, but accept flat cells."""
     image, region = content.image, content.region
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)
@@ -60,7 +60,7 @@ def unweighted(
     own_sides = side_ticks(grid, whole)
     is_frozen = frozen_axes(ticks, boundary_facets(mesh.cells, shared), own_sides, boundary, region is not None)
     sides = sides_of(grid, matrix, own_sides, boundary == "fixed", None if region is None else region.level)
-    # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
+    # If every cell is uniform, the rounding error of E_D must not become its unit.
     rounding = float(E_D_ROUNDING * content.variance / content.unit * content.n_voxels)
     wrong_side = 0.0 if region is None else float(content.wrong_side)
     objective = objective_of(grid, matrix, power, is_graded)
@@ -69,26 +69,26 @@ def unweighted(
 
 
 def weighted(state: State, geometry: float, image: float, surface: float = 0.0) -> State:
-    """The state with other weights of E_G, of squares and of voxels on the wrong side."""
+    """The state with other weights of E_G, squares and voxels on the wrong side."""
     return state._replace(objective=state.objective._replace(geometry=geometry, image=image, surface=surface))
 
 
 def content_energies(state: State, content: Content, n_means: int | None = None) -> tuple[float, float]:
     """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0.
 
-    Squares are around the cells' values, as `tetopt.engine.complex.image_energy` has them; with `n_means` all channels,
-    as Eq. (3) has them.
+    Squares are around the cells' values, as in `tetopt.engine.complex.image_energy`; if `n_means` is all channels, they
+    are around means, as in Eq. (3).
     """
     E_G, squares = energies(state, n_means)
     if content.region is not None:
-        # Voxels of the mask outside of the mesh, and others inside of it.
+        # Voxels of the mask outside the mesh, and others inside it.
         n_misfits = content.n_voxels + int(state.complex.sums[: int(state.complex.n_cells[0]), -1].sum())
         squares += state.objective.wrong_side * n_misfits
     return E_G, squares if squares > state.objective.rounding else 0.0
 
 
 def matrix_of(image: Image) -> NDArray[np.float64]:
-    """The map from index vectors to mm, (3, 3); of a 2-D image with a leading axis of its own."""
+    """The map from index vectors to mm, (3, 3); a 2-D image gets a leading axis."""
     matrix = np.eye(3)
     matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
     return matrix
@@ -98,7 +98,7 @@ def sides_of(
     grid: SamplingGrid, matrix: NDArray[np.float64], own_sides: NDArray[np.int64], is_fixed: bool,
     level: NDArray[np.float32] | None,
 ) -> Sides:  # fmt: skip
-    """Sides (3, 2) of a box, ticks, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function."""
+    """`Sides` from a box's sides (3, 2) in ticks, `matrix` (3, 3) from index to mm, and a surface's level function."""
     low, high = np.ascontiguousarray(own_sides.T)
     has_surface = level is not None
     level = np.zeros((1, 1, 1), dtype=np.float32) if level is None else level.reshape(grid.shape)
@@ -109,7 +109,7 @@ def sides_of(
 
 def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """For each set of frozen axes (bit d: axis d), the (3, 3) map from a vector in mm to the index vector along
-    the free axes that comes nearest to it: least squares in mm, so right for oblique and sheared axes.
+    the free axes that comes nearest to it: least squares in mm, so it is correct for oblique and sheared axes.
     """
     maps = np.zeros((8, 3, 3))
     for frozen in range(8):
@@ -119,7 +119,7 @@ def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
-    """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without an angle limit."""
+    """An objective of plain numbers, as the kernels require, with weights 1 and without an angle limit."""
     return Objective(
         volume=volume_of(grid),
         bits=int(grid.bits),
@@ -145,7 +145,7 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
 
 
 def with_min_dihedral(state: State, degrees: float) -> State:
-    """The state in which no move may leave a dihedral angle under `degrees`, nor one that is under it any smaller."""
+    """The state in which no move may leave a dihedral angle below `degrees`, or lower one that is below it already."""
     angle_limit, safe = angle_limit_of(degrees)
     return state._replace(objective=state.objective._replace(angle_limit=angle_limit, safe=safe))
 
@@ -153,9 +153,9 @@ def with_min_dihedral(state: State, degrees: float) -> State:
 def angle_limit_of(degrees: float) -> tuple[float, float]:
     """`angle_limit` and `safe` of an `Objective`, for a minimum dihedral angle; 0 for none.
 
-    Of all tetrahedra with a dihedral angle t up to a regular one's, eta is least for the one that is symmetric about
-    that edge and the opposite one: eta^3 = ((1 + s^2) / (s c))^2 / 8 with s, c = sin, cos(t / 2), and it falls as t
-    grows. In terms of S and the determinant eta^3 = S^3 / (432 det^2).
+    Among tetrahedra with a dihedral angle t up to a regular one's, eta is least for the one that is symmetric about
+    that edge and the opposite one: eta^3 = ((1 + s^2) / (s c))^2 / 8 with s, c = sin, cos(t / 2), which falls as t
+    grows. In terms of S and the determinant, eta^3 = S^3 / (432 det^2).
     """
     if degrees <= 0.0:
         return -1.0, np.inf

@@ -10,16 +10,16 @@ from tetopt.engine.complex import NodeStars, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
 
-NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
+NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels this near to 0 lies on all of them
 CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there
-CURVE_STEPS = 16  # onto a curve or a point, at most
-NEWTON_STEPS = 6  # onto the surface, at most
+CURVE_STEPS = 16  # at most, onto a curve or a point
+NEWTON_STEPS = 6  # at most, onto the surface
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
-ASIDE_VOXELS = 0.25  # on either side of a place: where the level is taken for its slope
-MOST_MEETING = 4  # labels whose levels a node is brought to; where more meet, four of them
-PARALLEL_FRACTION = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
+ASIDE_VOXELS = 0.25  # distance to either side of a place for the slope of the level
+MOST_MEETING = 4  # most labels whose levels a node is moved onto; where more meet, four of them
+PARALLEL_FRACTION = 1e-3  # squared sine of the angle between ways up, below which two surfaces count as one
 LEVELS_RISE = 2.0  # of one label's level over another's, per voxel across their surface
-FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
+FLAT_RISE = 1e-12  # least rise of a level along the way up that allows division
 
 
 @entry
@@ -43,7 +43,7 @@ def level_at(level: Singles3, i: float, j: float, k: float) -> float:
 
 @helper
 def _slope_at(slope: NDArray, row: int, state: State, node: int) -> None:
-    """Slope of the level at a node, per voxel along each axis, to slope[row]."""
+    """Write the slope of the level at a node, per voxel along each axis, to slope[row]."""
     ticks, scale, L = state.complex.ticks, 2.0**-state.objective.bits, state.sides.level
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
     slope[row, 0] = 2.0 * (level_at(L, i + ASIDE_VOXELS, j, k) - level_at(L, i - ASIDE_VOXELS, j, k))
@@ -53,7 +53,7 @@ def _slope_at(slope: NDArray, row: int, state: State, node: int) -> None:
 
 @unit
 def uphill_at(uphill: Floats2, state: State, node: int) -> None:
-    """The way up the level at a node, in mm, to uphill[0]; uphill (2, 3)."""
+    """Write the way up the level at a node, in mm, to uphill[0]; uphill is (2, 3)."""
     _slope_at(uphill, 1, state, node)
     for m in range(3):
         uphill[0, m] = 0.0
@@ -63,9 +63,9 @@ def uphill_at(uphill: Floats2, state: State, node: int) -> None:
 
 @unit
 def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: Floats2) -> bool:
-    """Whether a facet of the boundary, with the node `new` for `old`, faces up the level, or lies on a side of the box.
+    """True if a boundary facet, with the node `new` for `old`, faces up the level or lies on a side of the box.
 
-    A node that slid, or was put, across a gap onto another part of the surface would turn it over.
+    A node that slides or is put across a gap onto another part of the surface would reverse it.
     """
     t = state.complex.ticks
     a, b, c = outward(state.complex.cells, cell, k)
@@ -83,7 +83,7 @@ def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: Floats
 
 @unit
 def star_faces_up(uphill: Floats2, state: State, stars: NodeStars, node: int, joined: int) -> bool:
-    """`faces_up` for all facets of the boundary around a node where it is, of cells that do not have `joined`."""
+    """`faces_up` for all boundary facets around a node at its place, of cells without `joined`."""
     cells = state.complex.cells
     uphill_at(uphill, state, node)
     for r in range(stars.start[node], stars.start[node + 1]):
@@ -122,7 +122,7 @@ def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float)
 
 @unit
 def constraint_values(normal: Floats2, state: State, node: int) -> int:
-    """The values of a node's constraints, to normal[6, :3]; how many there are."""
+    """Write the values of a node's constraints to normal[6, :3]; return their number."""
     ticks, meeting, objective, count = state.complex.ticks, state.complex.meeting, state.objective, 0
     scale = 2.0**-objective.bits
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
@@ -140,9 +140,9 @@ def constraint_values(normal: Floats2, state: State, node: int) -> int:
 
 @unit
 def normals_at(normal: Floats2, state: State, node: int) -> int:
-    """Slopes and shortest ways up of a node's constraints within its sides of the box, in index units; their number.
+    """Write slopes and shortest ways up of a node's constraints, in index units; return their number.
 
-    `normal` is (7, 3): slopes in its first rows, ways from its fourth on.
+    Ways stay within the node's sides of the box. `normal` is (7, 3): slopes start in the first row, ways in the fourth.
     """
     P, ticks, scale, count = projection_at(state, node), state.complex.ticks, 2.0**-state.objective.bits, 0
     at = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
@@ -170,9 +170,9 @@ def normals_at(normal: Floats2, state: State, node: int) -> int:
 def combined_ways(
     normal: Floats2, count: int, r: tuple[float, float, float]
 ) -> tuple[bool, tuple[float, float, float]]:
-    """The shortest index vector along which the constraints rise by r, (3,), as `normals_at` left them in `normal`.
+    """The shortest index vector along which the constraints in `normal` (from `normals_at`) rise by r, (3,).
 
-    Whether there is one comes first: not where a level is flat, or two of them rise the same way.
+    The first result is True if there is one: not where a level is flat, or two levels rise the same way.
     """
     w = row(normal, 3)
     g00 = dot(row(normal, 0), w)
@@ -208,14 +208,14 @@ def combined_ways(
 
 @helper
 def band_of(state: State, node: int) -> float:
-    """By how much the levels of two labels may differ at a node; 0 where a third, or a mask's surface, meets them."""
+    """Allowed difference of two labels' levels at a node; 0 where a third label or a mask's surface meets them."""
     is_one = state.complex.meeting[node, 2] < 0 and not state.complex.is_frozen[node, 3]
     return LEVELS_RISE * state.complex.band[node] if is_one else 0.0
 
 
 @helper
 def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
-    """Whether all of a node's constraints are met."""
+    """True if a node meets all of its constraints."""
     count = constraint_values(normal, state, node)
     far, band = 0.0, band_of(state, node)
     for q in range(count):
@@ -225,7 +225,7 @@ def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
 
 @unit
 def slides(normal: Floats2, state: State, node: int) -> bool:
-    """Whether a node is on its surfaces and stays there; one between labels may not have got there yet."""
+    """True if a node is on its surfaces and stays there; a node between labels may not have reached them yet."""
     if state.complex.is_frozen[node, 3]:
         return True
     return state.complex.meeting[node, 1] >= 0 and is_on_surface(normal, state, node)
@@ -233,10 +233,10 @@ def slides(normal: Floats2, state: State, node: int) -> bool:
 
 @unit
 def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
-    """Move a node to where its constraints are met, nearly the shortest way in its sides of the box; False if not.
+    """Move a node to meet its constraints, nearly the shortest way in its sides of the box; return False on failure.
 
-    A place beyond the box is brought back to its side first: there the level only goes on as it is at the side, and
-    would have its zero there, too.
+    A place beyond the box first moves back to its side, as the level continues unchanged beyond the side and would have
+    its zero there, too.
     """
     ticks, scale = state.complex.ticks, 2.0**-state.objective.bits
     _put_in_box(state, node)

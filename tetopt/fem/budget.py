@@ -1,4 +1,4 @@
-"""How fine a reference's grid may be: as many degrees of freedom as fit a time, and the memory that is free."""
+"""Resolution of a reference's grid: as many degrees of freedom as fit a time and the free memory."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from tetopt.fem.voxels import Grid, grid_of, multigrid_of, preconditioned, stiff
 from tetopt.image import Image
 from tetopt.system.budget import available_bytes
 
-STEP_GROWTH = 1.02  # between voxel sizes that are tried for the reference's grid: it misses the limit by under 6 %
-TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take hardly more
-TIMED_DOFS = 3_000_000  # of the grid on which an iteration is timed: larger than the processor's caches
-SOLUTION_RATIO = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
-LEAST_DOFS = 1_000  # however little time there is
-FREE_FRACTION = 0.8  # of the memory that is free may be taken
+STEP_GROWTH = 1.02  # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
+TRIAL_DOFS = 50_000  # of the grid for counting iterations; finer ones take hardly more
+TIMED_DOFS = 3_000_000  # of the grid for timing an iteration: larger than the processor's caches
+SOLUTION_RATIO = 1.6  # iterations of a whole reference (homogeneous block, half resolution) over those of its solution
+LEAST_DOFS = 1_000  # minimum, however short the time
+FREE_FRACTION = 0.8  # usable fraction of the free memory
 
 
 class Budget(NamedTuple):
-    """What `affordable_dofs` returns."""
+    """Result of `affordable_dofs`."""
 
     dofs: int  # that fit
-    is_short_of_memory: bool  # whether it was the memory that set them, not the time
+    is_short_of_memory: bool  # True if memory set the limit, not time
 
 
 def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: int) -> tuple[int, ...]:
-    """The finest grid of nearly cubic voxels over the image's box of `dofs` or fewer, no finer than the image."""
+    """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer than the image."""
     n = len(shape)
     size = np.array(shape) * spacing
     step = spacing.min()
@@ -43,25 +43,25 @@ def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: in
 
 
 def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percent: float = 1.0) -> Budget:
-    """How many degrees of freedom the references for all of `nus` may have, to be solved in about `seconds`.
+    """Number of degrees of freedom of references for all of `nus` that can be solved in about `seconds`.
 
-    Iterations are counted on a small grid of the same moduli, since finer ones take hardly more, and one is timed on a
-    large one. So the choice differs a little from run to run; write it down to repeat it.
+    Iterations are counted on a small grid with the same moduli, since finer ones take hardly more, and one is timed on
+    a large grid. So the result varies slightly from run to run; record it to repeat a run.
 
     Parameters
     ----------
     modulus : Image
-        kPa, at the image's own resolution.
+        Young's moduli, kPa, at the image's resolution.
     nus : sequence of float
     seconds : float
-        Of wall time, on this machine as busy as it is now; above 0.
+        Wall time above 0, on this machine at its current load.
     percent : float
-        As of `tetopt.fem.reference.reference`.
+        As for `tetopt.fem.reference.reference`.
 
     Raises
     ------
     InputError
-        `seconds` not above 0; as `reference`.
+        `seconds` not above 0, or as for `reference`.
     """
     if not 0.0 < seconds < float("inf"):
         raise InputError(f"reference: expected more than 0 seconds, got {seconds}")
@@ -72,13 +72,13 @@ def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percen
     iterations = sum(reference(trial, nu, percent).work.iterations for nu in nus)
     timed = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TIMED_DOFS))
     in_time = seconds / (SOLUTION_RATIO * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
-    # The references stay, all of them, with two fields each.
+    # All references stay in memory, with two fields each.
     in_memory = FREE_FRACTION * available_bytes() / (DOF_BYTES + 16.0 * (len(nus) - 1))
     return Budget(max(LEAST_DOFS, int(min(in_time, in_memory, whole))), bool(in_memory < min(in_time, whole)))
 
 
 def seconds_of_iteration(grid: Grid) -> float:
-    """Wall time of one iteration for each degree of freedom: a cycle and a product."""
+    """Wall time of one iteration (a cycle and a product) per degree of freedom."""
     hierarchy, r = multigrid_of(grid), grid.nodes()
     r[:, 1:-1] = 1.0
     times = []

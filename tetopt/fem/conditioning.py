@@ -1,8 +1,8 @@
-"""Conditioning of the stiffness matrix: its extreme eigenvalues and what an iterative solver makes of them.
+"""Conditioning of the stiffness matrix: its extreme eigenvalues, and iterations of a solver.
 
 Section 3 compares meshes by the largest eigenvalue lambda and the condition number k of their stiffness matrices.
-Both are of the matrix that is solved with, that of the free dofs: without boundary conditions the smallest
-eigenvalue is 0. So they depend on what is held, and meshes are comparable under the same conditions only.
+Both refer to the matrix of the free dofs in the solved system, as without boundary conditions the smallest
+eigenvalue is 0. So they depend on the boundary conditions, which must be the same to compare meshes.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from tetopt.fem.elasticity import (
     on_one_blas_thread,
 )
 
-DENSE_DOFS = 32  # up to so many a full matrix is taken: the Lanczos solver wants more dofs than it finds eigenvalues
+DENSE_DOFS = 32  # up to which a full matrix is used, as the Lanczos solver needs more dofs than eigenvalues
 
 
 class Conditioning(NamedTuple):
-    """What `conditioning` returns."""
+    """Result of `conditioning`."""
 
     lambda_max: float  # largest eigenvalue of K_ff, kPa mm^(n-2)
     lambda_min: float  # smallest eigenvalue, above 0
-    cond: float  # the 2-norm condition number, their quotient
+    cond: float  # their quotient, the 2-norm condition number
     cg_iterations: int  # see `cg_iterations`, for the system's load
 
 
@@ -48,31 +48,30 @@ def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
     system : System
         From `tetopt.fem.elasticity.constrained`, or the `system` of a `Compression`.
     method : {"auto", "direct", "amg"}
-        For the smallest eigenvalue: by factorisation, which auto takes up to `DIRECT_DOFS` free dofs, or by
+        Method for the smallest eigenvalue: factorisation, which "auto" uses up to `DIRECT_DOFS` free dofs, or
         LOBPCG preconditioned by multigrid.
 
     Returns
     -------
     Conditioning
-        Eigenvalues good to a relative 1e-7 or better. Nothing is random: the same in every run, on any number of
-        threads.
+        Eigenvalues with a relative accuracy of 1e-7 or better, and deterministic on any number of threads.
 
     Raises
     ------
     InputError
-        Another method, or no free dof: every node is held.
+        Unknown method, or no free dof, as every node is fixed.
     RuntimeError
         An eigenvalue or the solution did not converge.
     """
     if len(system.free) == 0:
-        raise InputError("conditioning: every node is fixed or pushed, so there is nothing to solve; take a finer mesh")
+        raise InputError("conditioning: every node is fixed or pushed, so there is nothing to solve; use a finer mesh")
     largest = lambda_max(system.K_ff)
     smallest = lambda_min(system.K_ff, None if is_direct(system, method) else multigrid(system))
     return Conditioning(largest, smallest, largest / smallest, cg_iterations(system.K_ff, system.load))
 
 
 def lambda_max(K_ff: csr_array) -> float:
-    """Largest eigenvalue of a symmetric matrix, by Lanczos from a fixed start.
+    """Largest eigenvalue of a symmetric matrix, by Lanczos iterations from a fixed start.
 
     Raises
     ------
@@ -91,8 +90,8 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
     ----------
     K_ff : (F, F) csr_array
     preconditioner : (F, F) LinearOperator, optional
-        Near the inverse of K_ff, see `tetopt.fem.elasticity.multigrid`: LOBPCG is taken. Without it K_ff is
-        factorised and the largest eigenvalue of its inverse found by Lanczos.
+        Approximate inverse of K_ff for LOBPCG, see `tetopt.fem.elasticity.multigrid`. Without it K_ff is
+        factorised, and Lanczos iterations find the largest eigenvalue of its inverse.
 
     Raises
     ------
@@ -107,7 +106,7 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
 
 
 def _by_inverse(K_ff: csr_array, solve: Callable[[NDArray], NDArray], tol: float = 0.0) -> float:
-    """The smallest eigenvalue by Lanczos on the inverse of K_ff, each product a solution; `tol` 0 is all digits."""
+    """Smallest eigenvalue by Lanczos on the inverse of K_ff, where each product is a solve; `tol` 0 is all digits."""
     inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
     return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse, tol=tol)
 
@@ -122,47 +121,47 @@ def _by_lanczos(K_ff: csr_array, extreme: str, **options: Any) -> float:
 
 
 def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
-    """Four vectors at a time, for the lowest eigenvalues of a body lie close together."""
+    """Smallest eigenvalue by LOBPCG with four vectors, as the lowest eigenvalues of a body are close together."""
     vectors = _start(K_ff, 4)
-    vectors = np.column_stack([preconditioner @ vector for vector in vectors.T])  # smooth already: fewer steps
+    vectors = np.column_stack([preconditioner @ vector for vector in vectors.T])  # start smooth, to save steps
     estimate = np.inf
     for _ in range(5):
         scale = estimate if np.isfinite(estimate) else float(K_ff.diagonal().mean())
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # it warns of what is checked below
+            warnings.simplefilter("ignore", UserWarning)  # its warnings are covered by the check below
             values, vectors = lobpcg(K_ff, vectors, M=preconditioner, largest=False, tol=1e-5 * scale, maxiter=60)
         estimate, vector = float(values[0]), vectors[:, 0]
         residual = float(np.linalg.norm(K_ff @ vector - estimate * vector) / np.linalg.norm(vector))
-        # The eigenvalue's error is about residual^2 over the gap to the next one.
+        # The eigenvalue's error is about residual^2 over the gap to the next eigenvalue.
         if residual <= 1e-4 * estimate:
             return estimate
 
     def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
         solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
         if failure:
-            raise RuntimeError("conditioning: the smallest eigenvalue did not converge: a solve did not")
+            raise RuntimeError("conditioning: the smallest eigenvalue did not converge, as a solve did not")
         return solution
 
-    return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but where moduli differ a lot it comes through
+    return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but converges if moduli differ widely
 
 
 def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_FRACTION) -> int:
-    """Steps that conjugate gradients with the diagonal as preconditioner take to solve K_ff x = load from x = 0.
+    """Number of steps of diagonally preconditioned conjugate gradients that solve K_ff x = load from x = 0.
 
     Parameters
     ----------
     K_ff : (F, F) csr_array
         Symmetric, positive definite.
     load : (F,) float64
-        In `conditioning` that of the system: the pull of the prescribed displacements. The count depends on it,
+        In `conditioning` it is the system's: the forces of the prescribed displacements. The count depends on it,
         and may differ by one between machines.
     rtol : float
-        Residual over load, 2-norms, at which it is solved.
+        Residual over load, in 2-norms, of a solution.
 
     Raises
     ------
     RuntimeError
-        Not solved after 10 F steps.
+        No solution after 10 F steps.
     """
     steps = 0
 

@@ -1,22 +1,22 @@
 """Linear elasticity on the mesh: linear or quadratic displacements in each cell, of order 1 or 2.
 
 The strain energy of a cell is 1/2 u^T B^T C' B u E v, with E the mean of the modulus field over the cell and v its
-volume, Eq. (2). Written with the gradients g_a of the cell's shape functions and the two Lame constants, the block of
+volume, Eq. (2). In terms of the gradients g_a of the cell's shape functions and the two Lame constants, the block of
 the stiffness matrix between nodes a and b is
 
     K_ab = sum over Gauss points of w v (lambda g_a g_b^T + mu g_b g_a^T + mu (g_a . g_b) I),
 
-which is B_a^T C B_b multiplied out; in two dimensions lambda is that of plane stress. With linear cells there is one
-point; with quadratic ones there are n + 1, which integrate it exactly, and the modulus may differ between them. Where
-the mesh has midpoints, cells are isoparametric: gradients and volumes are those at each point of the curved cell
-(Zienkiewicz and Taylor, The Finite Element Method, volume 1, chapter 5), and there are more points. It
-takes fewer lines this way than through scikit-fem's forms and runs three to six times faster, and K comes out
-symmetric to the last bit; scikit-fem is the tests' oracle.
+which is B_a^T C B_b multiplied out; in two dimensions lambda is that of plane stress. Linear cells have one point;
+quadratic ones have n + 1, which integrate it exactly, and the modulus may differ between them. If the mesh has
+midpoints, cells are isoparametric: gradients and volumes are those at each point of the curved cell (Zienkiewicz and
+Taylor, The Finite Element Method, volume 1, chapter 5), and there are more points. This takes fewer lines than
+scikit-fem's forms, is three to six times faster, and makes K symmetric to the last bit; the tests use scikit-fem as
+the oracle.
 
 Units: lengths in mm and moduli in kPa = mN/mm^2 give forces in mN and energies in mN mm = uJ. A two-dimensional
 mesh is a plate 1 mm thick, in plane stress.
 
-Degrees of freedom go node by node: component d of node i is number i n + d. Nodes of order 2 are those of
+Degrees of freedom are ordered by node: component d of node i is number i n + d. Nodes of order 2 are those of
 `tetopt.geometry.quadratic.quadratic`.
 """
 
@@ -57,19 +57,19 @@ Method = Literal["auto", "direct", "amg"]
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# Free dofs up to which the matrix is factorised. Filling in is what a factorisation costs: in 3-D 14 k dofs take
-# 3 s and 57 k take 140 s and 4 GB, where multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
+# Free dofs up to which the matrix is factorised. The cost of a factorisation is its fill-in: in 3-D 14 k dofs take
+# 3 s and 57 k take 140 s and 4 GB, whereas multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
 DIRECT_DOFS = {2: 200_000, 3: 10_000}
-PAIR_BYTES = 160.0  # of memory for each pair of a cell's nodes: numbers, entries, as they are sorted, and the matrix
-RESIDUAL_FRACTION = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
+PAIR_BYTES = 160.0  # of memory per pair of a cell's nodes: numbers, entries, their sorting, and the matrix
+RESIDUAL_FRACTION = 1e-10  # target residual over load of an iterative solution; ten times as much is an error
 
 
 def on_one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """The function, in which BLAS and LAPACK use one thread: how they round depends on how they share the work.
+    """Wrap a function so that BLAS and LAPACK use one thread, as their rounding depends on the sharing of work.
 
-    So the same bits come out on any number of threads. Nothing is lost: assembly, sparse products and relaxation are
-    serial anyway, and inner products and the coarsest grid too small; on a busy machine two threads took four times as
-    long as one.
+    So results are the same to the last bit on any number of threads. This costs no time: assembly, sparse products and
+    relaxation are serial anyway, and inner products and the coarsest grid are too small; on a busy machine two threads
+    took four times as long as one.
     """
 
     @wraps(function)
@@ -81,58 +81,58 @@ def on_one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Argume
 
 
 class Outside(NamedTuple):
-    """What acts on the nodes from outside."""
+    """External forces and springs on the nodes."""
 
     forces: NDArray[np.float64]  # (N, n) mN, world
     springs: NDArray[np.float64]  # (N,) mN/mm, from the node to the ground, the same in all directions
 
 
 class System(NamedTuple):
-    """K u = f, with some of the displacements prescribed and known forces, mostly none, on the others."""
+    """K u = f, with some displacements prescribed, and known forces (usually none) on the others."""
 
-    K: csr_array  # (N*n, N*n) of all dofs, springs with them; dofs are components along the columns of `frame`
+    K: csr_array  # (N*n, N*n) of all dofs, including springs; dofs are components along the columns of `frame`
     free: NDArray[np.int64]  # (F,) dofs that are not prescribed, ascending
-    K_ff: csr_array  # (F, F) among the free ones: symmetric, positive definite
-    load: NDArray[np.float64]  # (F,) mN, f - K_fc u_c: the forces, and how the prescribed dofs pull at the free ones
+    K_ff: csr_array  # (F, F) block of the free dofs: symmetric, positive definite
+    load: NDArray[np.float64]  # (F,) mN, f - K_fc u_c: the forces, plus those of the prescribed dofs on the free ones
     prescribed: NDArray[np.float64]  # (N*n,) mm, 0 at the free dofs
     modes: NDArray[np.float64]  # (N*n, 3 or 6) rigid motions
     frame: NDArray[np.float64]  # (n, n) a rotation; the identity if dofs are components along the world's axes
-    of_corners: csr_array | None = None  # (N, corners) of order 2: linear displacements at its nodes from the corners'
+    of_corners: csr_array | None = None  # (N, corners) for order 2: linear displacements at its nodes from the corners'
 
 
 class Compression(NamedTuple):
-    """What `compression` returns."""
+    """Result of `compression`."""
 
     u: NDArray[np.float64]  # (N, n) displacement, mm, world
-    strain_energy: float  # E_strain = 1/2 u^T K u, uJ (a mm of thickness in 2-D)
-    reaction: NDArray[np.float64]  # (n,) force that holds the pushed nodes there, mN, world
-    system: System  # as it was solved, for `tetopt.fem.conditioning`
+    strain_energy: float  # E_strain = 1/2 u^T K u, uJ (per mm of thickness in 2-D)
+    reaction: NDArray[np.float64]  # (n,) force that holds the pushed nodes, mN, world
+    system: System  # the solved system, for `tetopt.fem.conditioning`
 
 
 def stiffness(mesh: Mesh, young: ArrayLike, nu: ArrayLike, order: int = 1) -> csr_array:
-    """The stiffness matrix, (N*n, N*n), mN/mm, of the N nodes of the order; in 2-D plane stress, by mm of thickness.
+    """Stiffness matrix, (N*n, N*n), mN/mm, of the N nodes of the order; in 2-D plane stress, per mm of thickness.
 
     Parameters
     ----------
     mesh : Mesh
     young : (M,) or (M, Q) array of real numbers, or one for all
-        Young's modulus of each cell, kPa, above 0, or at each of its Gauss points
-        (`tetopt.geometry.quadratic.gauss_rule`); n + 1 of a curved cell are of its parts nearest to each corner.
-        Eq. (2): the mean over the cell.
+        Young's modulus of each cell, kPa, above 0: in Eq. (2) the mean over the cell. Or moduli at its Gauss points
+        (`tetopt.geometry.quadratic.gauss_rule`); n + 1 moduli of a curved cell belong to its parts nearest to each
+        corner.
     nu : (M,) array, or one number for all
-        Poisson's ratio, -1 < nu < 0.5. Linear cells lock as it nears 0.5: they are then far too stiff.
+        Poisson's ratio, -1 < nu < 0.5. Near 0.5 linear cells lock, that is, they are far too stiff.
     order : {1, 2}
-        Of the displacements in a cell.
+        Order of the displacements in a cell.
 
     Returns
     -------
     csr_array
-        Exactly symmetric, positive semi-definite; its null space are the rigid motions of each piece.
+        Exactly symmetric, positive semi-definite; its null space consists of the rigid motions of each component.
 
     Raises
     ------
     InputError
-        A modulus that is not a number above 0, one modulus too many or too few, nu out of range, or another order.
+        A modulus that is not above 0, a wrong number of moduli, nu out of range, or an invalid order.
 
     Examples
     --------
@@ -145,23 +145,22 @@ def stiffness(mesh: Mesh, young: ArrayLike, nu: ArrayLike, order: int = 1) -> cs
 
 
 class Elements(NamedTuple):
-    """The cells of a mesh as elements of one order; `elements_of` makes them."""
+    """The cells of a mesh as elements of one order; made by `elements_of`."""
 
     points: NDArray[np.float64]  # (N, n) nodes of the order, mm
     cells: NDArray[np.int64]  # (M, A) their nodes
     volumes: NDArray[np.float64]  # (M,) mm^n
-    gradients: NDArray[np.float64]  # (M, n+1, n) of the barycentric coordinates, 1/mm
+    gradients: NDArray[np.float64]  # (M, n+1, n) gradients of the barycentric coordinates, 1/mm
     slopes: NDArray[np.float64]  # (Q, A, n+1) of the shape functions by these coordinates, at the Gauss points
-    weights: NDArray[np.float64]  # (Q,) of the Gauss points
-    is_curved: bool = False  # volumes and gradients are those of the straight cells
+    weights: NDArray[np.float64]  # (Q,) weights of the Gauss points
+    is_curved: bool = False  # volumes and gradients are always those of straight cells
 
     def at_points(self, frame: NDArray[np.float64] | None = None) -> Iterator[tuple[NDArray[np.float64], ...]]:
-        """Of each Gauss point the shape functions' gradients (M, A, n), along the columns of a frame (n, n), and the
-        volume (M,) it stands for."""
+        """For each Gauss point, the shape functions' gradients (M, A, n) in a frame (n, n) and its volume (M,)."""
         n = self.points.shape[1]
         turned = self.gradients if frame is None or self.is_curved else self.gradients @ frame
         for slopes, weight in zip(self.slopes, self.weights, strict=True):
-            # One term is 1, all others are 0, for linear cells: their gradients come through to the last bit.
+            # For linear cells one term is 1 and all others are 0, so their gradients stay exact to the last bit.
             g = sum(slopes[:, k, None] * turned[:, None, k] for k in range(n + 1))
             volume = weight * self.volumes
             if self.is_curved:
@@ -172,7 +171,7 @@ class Elements(NamedTuple):
 
 
 def elements_of(mesh: Mesh, order: int) -> Elements:
-    """The mesh's cells as elements of order 1 or 2; InputError for another order, or folded cells."""
+    """The mesh's cells as elements of order 1 or 2; raise InputError for another order or folded cells."""
     points, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
     is_curved = mesh.midpoints is not None and order == 2
     places, weights = gauss_rule(mesh.ndim, order, is_curved)
@@ -187,18 +186,18 @@ def elements_of(mesh: Mesh, order: int) -> Elements:
 def _stiffness(
     elements: Elements, young: NDArray[np.float64], nu: NDArray[np.float64], frame: NDArray[np.float64]
 ) -> csr_array:
-    """`stiffness` with dofs along the columns of `frame`: an isotropic law only needs its gradients turned.
+    """`stiffness` with dofs along the columns of `frame`: for an isotropic law it suffices to rotate the gradients.
 
     `young` (M, Q), `nu` (M,).
     """
     n_nodes, n = elements.points.shape
     n_cells, n_corners = elements.cells.shape
-    what = f"elasticity: the stiffness of {n_cells} cells of {n_corners} nodes"
-    check_memory(PAIR_BYTES * n_cells * n_corners**2, what, "take a coarser mesh, or cells of order 1")
+    what = f"elasticity: the stiffness of {n_cells} cells with {n_corners} nodes each"
+    check_memory(PAIR_BYTES * n_cells * n_corners**2, what, "use a coarser mesh, or order 1")
     pairs, slot = np.unique(elements.cells[:, :, None] * n_nodes + elements.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
     blocks = np.empty((len(pairs), n, n))
-    points = []  # of Gauss: gradients of the shape functions, (M, A, n), and the constants there
+    points = []  # Gauss points: gradients of the shape functions, (M, A, n), and the constants there
     for (g, volume), moduli in zip(elements.at_points(frame), young.T, strict=True):
         lame, mu = (constant * volume for constant in lame_constants(moduli, nu, n))
         points.append((g, lame[:, None, None], mu[:, None, None]))
@@ -211,7 +210,7 @@ def _stiffness(
             )
             if i == j:
                 entries += shear
-            # In the order of the cells for (a, b) as for (b, a), so that K is symmetric to the last bit.
+            # (a, b) and (b, a) are summed in the same order of cells, so that K is symmetric to the last bit.
             blocks[:, i, j] = np.bincount(slot, weights=entries.ravel(), minlength=len(pairs))
             if i != j:
                 blocks[:, j, i] = np.bincount(slot, weights=entries.swapaxes(1, 2).ravel(), minlength=len(pairs))
@@ -220,7 +219,7 @@ def _stiffness(
 
 
 def _sum(arrays: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The sum of arrays that are made one by one, from the first to the last, in the memory of the first."""
+    """Sum arrays made one by one, from first to last, in the memory of the first."""
     iterator = iter(arrays)
     total = next(iterator)
     for array in iterator:
@@ -229,7 +228,7 @@ def _sum(arrays: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Volumes (M,) and gradients of the barycentric coordinates (M, n+1, n), 1/mm: how v grows with a node, over v."""
+    """Volumes v (M,) and gradients of barycentric coordinates (M, n+1, n), 1/mm: derivatives of v by nodes, over v."""
     v = volumes(mesh.points, mesh.cells)
     return v, volume_gradients(mesh.points, mesh.cells) / v[:, None, None]
 
@@ -243,9 +242,9 @@ def lame_constants(
 
 
 def gauss_strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Strain at the Gauss points of each cell, (M, Q, n, n) float64, symmetric, of displacements `u`, (N, n) mm.
+    """Strain at the Gauss points of each cell, (M, Q, n, n) float64, symmetric, from displacements `u`, (N, n) mm.
 
-    `u` has a row for each node of the mesh (Q = 1), or for each of order 2 (Q = n + 1, or that of curved cells).
+    `u` has a row for each node of the mesh (Q = 1), or of order 2 (Q = n + 1, or the number for curved cells).
     """
     elements = elements_of(mesh, order_of(mesh, u))
     if elements.is_curved:
@@ -256,19 +255,19 @@ def gauss_strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean strain in each cell, (M, n, n) float64, symmetric, of displacements `u` as in `gauss_strains`."""
+    """Mean strain in each cell, (M, n, n) float64, symmetric, from displacements `u` as in `gauss_strains`."""
     return cell_means(gauss_strains(mesh, u))
 
 
 def cell_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean over each cell, (M, ...), of values at its Gauss points (M, Q, ...); of a curved one as if straight."""
+    """Mean over each cell, (M, ...), of values at its Gauss points (M, Q, ...); curved cells count as straight."""
     if (n_points := values.shape[1]) not in CURVED_POINTS:
         return values.mean(axis=1)
     return np.tensordot(values, curved_rule(CURVED_POINTS[n_points])[1], axes=(1, 0))
 
 
 def gauss_volumes(mesh: Mesh, order: int) -> NDArray[np.float64]:
-    """The volume that each Gauss point of a cell stands for, (M, Q), mm^n."""
+    """The volume of each Gauss point of a cell, (M, Q), mm^n."""
     return np.stack([volume for _, volume in elements_of(mesh, order).at_points()], axis=1)
 
 
@@ -283,8 +282,8 @@ def order_of(mesh: Mesh, u: NDArray[np.float64]) -> int:
 def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Nodes on the bottom and the top of the image's box, int64, ascending.
 
-    These are its faces across the index axis whose direction in the world is nearest to the last world axis: z in 3-D,
-    inferior to superior, and y in 2-D.
+    These are the faces across the index axis nearest to the last world axis: z in 3-D, inferior to superior, and y in
+    2-D.
 
     Parameters
     ----------
@@ -296,12 +295,12 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.i
     Returns
     -------
     low_nodes, high_nodes
-        High is the side of the larger z (y in 2-D).
+        Nodes on either face; high is the side of larger z (y in 2-D).
 
     Raises
     ------
     InputError
-        Another dimension, or a face without nodes.
+        Different dimensions, or a face without nodes.
     """
     n = image.ndim
     if mesh.ndim != n:
@@ -313,30 +312,30 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.i
     for side, is_there in zip(sides[axis], is_on, strict=True):
         if not is_there.any():
             raise InputError(
-                f"mesh: no node lies on the image's face at index {side:g} of axis {axis}, the mesh runs from "
-                f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, crop and slice?"
+                f"mesh: no node lies on the image's face at index {side:g} of axis {axis}; the mesh extends from "
+                f"{place.min():g} to {place.max():g}, but must fill the image's box: same image, crop and slice?"
             )
     low, high = (np.flatnonzero(is_there) for is_there in (is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]))
     return low, high
 
 
 def push_of(image: Image, percent: float) -> NDArray[np.float64]:
-    """Displacement of the bottom in a compression by `percent`, (n,) mm: along the faces' normal, towards the top.
+    """Displacement of the bottom in a compression by `percent`, (n,) mm, along the faces' normal towards the top.
 
-    `percent` of the distance between the two faces that `box_faces` finds, so that an image turned in the world, or
-    an oblique one, is pressed by as much.
+    `percent` refers to the distance between the two faces of `box_faces`, so that a rotated or oblique image is
+    compressed by as much.
     """
     n = image.ndim
     axis = upright_axis(image.affine)
-    normal = np.linalg.inv(image.affine[:n, :n])[axis]  # of the faces; as long as one over a voxel's thickness
+    normal = np.linalg.inv(image.affine[:n, :n])[axis]  # normal of the faces, with length 1 over a voxel's thickness
     towards_top = 1.0 if image.affine[n - 1, axis] > 0.0 else -1.0
     return 0.01 * percent * image.shape[axis] * towards_top * normal / float(normal @ normal)
 
 
 def check_fills_box(image: Image, mesh: Mesh) -> None:
-    """InputError unless every boundary facet of the mesh lies on a face of the image's box, and it is all filled.
+    """Raise InputError unless every boundary facet lies on a face of the image's box and the box is filled.
 
-    So a mesh with a crack, of several pieces, laid over itself or joined without shared nodes is refused.
+    This rejects meshes with cracks, several components, overlaps, or parts joined without shared nodes.
     """
     check_unfolded(mesh)
     outer, on_box = facets_on_box(mesh, image)
@@ -344,11 +343,11 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
         inner = np.flatnonzero(~on_box)
         raise InputError(
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
-            f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is of another image, or crop"
+            f"{outer[inner[0]].tolist()}: it has a crack or several components, or belongs to another image or crop"
         )
     filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-5:
-        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box; they overlap or leave parts out")
+        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box: they overlap or leave gaps")
 
 
 def constrained(
@@ -362,16 +361,16 @@ def constrained(
     frame: NDArray[np.float64] | None = None,
     outside: Outside | None = None,
 ) -> System:
-    """The equations of the mesh with some displacements given.
+    """Set up the equations of the mesh with some prescribed displacements.
 
     Parameters
     ----------
     mesh, young, nu, order
         As for `stiffness`.
     is_prescribed : (N, n) bool
-        Of the nodes of the order.
+        Mask of prescribed components at the nodes of the order.
     prescribed : (N, n) float64
-        Displacements, mm; counted only where prescribed.
+        Displacements, mm; used only where prescribed.
     frame : (n, n) float64, optional
         A rotation. The two arrays, and the system's dofs, are then components along its columns.
     outside : Outside, optional
@@ -380,9 +379,9 @@ def constrained(
     Raises
     ------
     InputError
-        As `stiffness`; wrong shapes, displacements that are not finite; cells that overlap across the facet they
-        share; or a part of the mesh that could still move without being strained: one without any prescribed node or
-        spring, or one that hangs by too few.
+        As for `stiffness`; wrong shapes; displacements that are not finite; cells that overlap at a common facet; or a
+        part of the mesh that can move without strain, as it has no prescribed node or spring, or is connected by too
+        few nodes.
     """
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
@@ -391,7 +390,7 @@ def constrained(
     is_prescribed, prescribed = np.asarray(is_prescribed, dtype=bool), np.asarray(prescribed, dtype=np.float64)
     for name, array in (("is_prescribed", is_prescribed), ("prescribed", prescribed)):
         if array.shape != elements.points.shape:
-            raise InputError(f"{name}: expected shape {elements.points.shape}, a row a node, got {array.shape}")
+            raise InputError(f"{name}: expected shape {elements.points.shape}, one row per node, got {array.shape}")
     values = np.where(is_prescribed, prescribed, 0.0)
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
@@ -413,7 +412,7 @@ def constrained(
 
 
 def _of_corners(elements: Elements, n_corners: int) -> csr_array:
-    """The interpolation of linear displacements at the nodes of order 2, (N, corners): the ends' mean on an edge."""
+    """Interpolation of linear displacements at the nodes of order 2, (N, corners): the ends' mean on an edge."""
     n_nodes, n = elements.points.shape
     ends = np.empty((n_nodes - n_corners, 2), dtype=np.int64)
     ends[elements.cells[:, n + 1 :] - n_corners] = elements.cells[:, cell_edges(n)]
@@ -436,34 +435,33 @@ def compression(
     is_bonded: bool = True,
     method: Method = "auto",
 ) -> Compression:
-    """Hold one side of the mesh and push the other: the paper's test of conditioning and strain energy (Section 3).
+    """Fix one side of the mesh and push the other: the paper's test of conditioning and strain energy (Section 3).
 
     Parameters
     ----------
     mesh, young, nu, order
         As for `stiffness`.
     fixed_nodes, pushed_nodes : (K,) arrays of integers
-        Nodes of the mesh, such as `box_faces` returns. The paper fixes the top and compresses the bottom. With order 2
-        the nodes between two of them are, too.
+        Nodes of the mesh, such as from `box_faces`. The paper fixes the top and pushes the bottom. For order 2, nodes
+        between two of them are included.
     displacement : (n,) array
         Displacement of the pushed nodes, mm, world.
     is_bonded : bool
         True: the tissue sticks to both plates; fixed nodes do not move and pushed ones move by `displacement`.
         False: it slides along them without friction; only the displacement along the push is prescribed, 0 at
-        the fixed nodes. What rigid motion that leaves (sliding along and turning about the push) is taken away
+        the fixed nodes. The remaining rigid motions (sliding across and turning about the push) are suppressed
         at one fixed node and, in 3-D, at the one farthest from it; no force acts there, but the matrix is far
-        worse conditioned than of a bonded mesh. Pieces of mesh that do not hang together then have nothing that
-        keeps them from sliding apart, and are refused.
+        worse conditioned than that of a bonded mesh. Disconnected components could slide apart, and are rejected.
     method : {"auto", "direct", "amg"}
         See `solved`.
 
     Raises
     ------
     InputError
-        As `constrained`; a side without nodes or with numbers that are no nodes; a node on both sides; or a
+        As for `constrained`; a side without nodes or with invalid node numbers; a node on both sides; or a
         displacement that is 0 or not n finite numbers.
     RuntimeError
-        As `solved`.
+        As for `solved`.
 
     Examples
     --------
@@ -484,7 +482,7 @@ def compression(
     if len(both):
         raise InputError(
             f"fixed_nodes and pushed_nodes: {len(both)} nodes are in both, the first {both[:5].tolist()}; "
-            "they cannot rest and move by the displacement"
+            "a node cannot be both fixed and displaced"
         )
     points, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
     if order == 2:
@@ -510,7 +508,7 @@ def compression(
 
 
 def _with_midpoints(mesh: Mesh, cells: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes of order 2, whose cells are `cells`: the mesh's nodes given, and the middles of edges between them."""
+    """Nodes of order 2, with cells `cells`: the given nodes of the mesh, and the mid-edge nodes between them."""
     is_chosen = np.zeros(len(mesh.points), dtype=bool)
     is_chosen[nodes] = True
     is_between = is_chosen[mesh.cells[:, cell_edges(mesh.ndim)]].all(axis=2)
@@ -518,9 +516,9 @@ def _with_midpoints(mesh: Mesh, cells: NDArray[np.int64], nodes: NDArray[np.int6
 
 
 def _sliding_frame(fixed: NDArray[np.float64], push: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """A rotation whose first column is the push, the second from the first fixed point to the farthest across it.
+    """A rotation with the push as first column; the second points from the first fixed point to the farthest across.
 
-    The farthest point's number comes with it. Holding there the third component stops the turn about the push.
+    The farthest point's number is returned, too. Fixing its third component prevents rotation about the push.
     """
     first = push / np.linalg.norm(push)
     if len(push) == 2:
@@ -538,21 +536,21 @@ def _sliding_frame(fixed: NDArray[np.float64], push: NDArray[np.float64]) -> tup
 
 
 def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
-    """Displacement of every node, (N, n) float64, mm, in world components.
+    """Solve for the displacement of every node, (N, n) float64, mm, in world components.
 
     Parameters
     ----------
     system : System
     method : {"auto", "direct", "amg"}
-        By factorisation, or by conjugate gradients preconditioned by algebraic multigrid, to a residual of 1e-10
-        of the load. Auto factorises up to `DIRECT_DOFS` free dofs.
+        Factorisation, or conjugate gradients preconditioned by algebraic multigrid, to a residual of 1e-10
+        of the load. "auto" factorises up to `DIRECT_DOFS` free dofs.
 
     Raises
     ------
     InputError
-        Another method.
+        Unknown method.
     RuntimeError
-        The residual stayed above ten times that, as it may for moduli that differ by more than 9 orders of
+        The residual stayed above ten times that, as it may if moduli differ by more than 9 orders of
         magnitude.
     """
     return solved_in_steps(system, method)[0]
@@ -560,7 +558,7 @@ def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
 
 @on_one_blas_thread
 def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
-    """What `solved` returns, and how many steps conjugate gradients took: 0 where the matrix was factorised."""
+    """The result of `solved`, and the number of conjugate gradient steps: 0 if the matrix was factorised."""
     n, n_steps = len(system.frame), 0
 
     def count(_: NDArray[np.float64]) -> None:
@@ -577,33 +575,34 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_FRACTION * float(np.linalg.norm(system.load))
         if not residual <= allowed:
-            raise RuntimeError(f"elasticity: not solved, the residual is {residual:.3g} mN where {allowed:.3g} may be")
+            raise RuntimeError(f"elasticity: not solved, the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
         dofs[system.free] = solution
     return dofs.reshape(-1, n) @ system.frame.T, n_steps
 
 
 def is_direct(system: System, method: Method) -> bool:
-    """Whether to factorise K_ff; InputError for an unknown method."""
+    """True if the method factorises K_ff; raise InputError for an unknown method."""
     if method not in ("auto", "direct", "amg"):
         raise InputError(f"method: expected auto, direct or amg, got {method!r}")
     return method == "direct" or (method == "auto" and len(system.free) <= DIRECT_DOFS[len(system.frame)])
 
 
 def factorized(K_ff: csr_array):  # type: ignore[no-untyped-def]
-    """The solution of K_ff x = b as a function of b, by sparse factorisation; K_ff symmetric positive definite."""
+    """The solution of K_ff x = b as a function of b, by sparse factorisation of the positive definite K_ff."""
     return splu(K_ff.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve
 
 
 def multigrid(system: System) -> LinearOperator:
-    """One V-cycle on K_ff, (F, F): symmetric, and nothing about it is random.
+    """One V-cycle on K_ff, (F, F), symmetric and deterministic.
 
-    With linear cells it is of smoothed aggregation, of nodes, not dofs, which reproduces the rigid motions. For that
-    the prescribed dofs stay in as equations of their own, coupled to none.
+    For linear cells it uses smoothed aggregation of nodes, not dofs, which reproduces the rigid motions. For that, the
+    prescribed dofs remain as separate, uncoupled equations.
 
-    With quadratic cells the first coarse level are the linear displacements, K of which is that of linear cells, and
-    aggregation goes on from there. With 333,000 dofs on a BCC lattice, moduli of 1 : 10 and nu 0.3, conjugate gradients
-    then take 27 steps and 10 s instead of 49 and 30 s by aggregation of all nodes of order 2; with 1 : 10^4 38 and 14 s
-    instead of 292 and 144 s; at nu 0.45 41 and 14 s instead of 45 and 25 s, and 66 and 21 s instead of 83 and 44 s.
+    For quadratic cells the first coarse level consists of the linear displacements, with the K of linear cells, and
+    aggregation continues from there. With 333,000 dofs on a BCC lattice, moduli of 1 : 10 and nu 0.3, conjugate
+    gradients then take 27 steps and 10 s instead of 49 and 30 s with aggregation of all nodes of order 2; with 1 : 10^4
+    38 and 14 s instead of 292 and 144 s; at nu 0.45 41 and 14 s instead of 45 and 25 s, and 66 and 21 s instead of 83
+    and 44 s.
     """
     from pyamg import smoothed_aggregation_solver  # type: ignore[import-untyped]  # half a second: only when needed
     from pyamg.multilevel import MultilevelSolver  # type: ignore[import-untyped]
@@ -612,7 +611,7 @@ def multigrid(system: System) -> LinearOperator:
     n, n_dofs = len(system.frame), system.K.shape[0]
     is_free = np.zeros(n_dofs)
     is_free[system.free] = 1.0
-    alone = system.K.diagonal().mean()  # what stands on the diagonal of a prescribed dof
+    alone = system.K.diagonal().mean()  # diagonal entry of a prescribed dof
     K = _with_held(system.K, is_free, alone)
     levels = []
     modes = system.modes * is_free[:, None]
@@ -629,12 +628,12 @@ def multigrid(system: System) -> LinearOperator:
         bsr_matrix(K.tobsr((n, n))),
         B=modes,
         strength=("symmetric", {"theta": 0.1}),
-        smooth=("jacobi", {"weighting": "local"}),  # its other weightings start from random vectors
+        smooth=("jacobi", {"weighting": "local"}),  # other weightings start from random vectors
         improve_candidates=None,
         max_coarse=50,
     )
     whole = MultilevelSolver(levels + hierarchy.levels)
-    # One sweep over quadratic cells before and one back after take more steps, and less time, than two each.
+    # One sweep over quadratic cells before and one backwards after take more steps, but less time, than two each.
     for_all = [("block_gauss_seidel", {"sweep": "symmetric"})]
     before, after = ([("block_gauss_seidel", {"sweep": way})] * len(levels) for way in ("forward", "backward"))
     change_smoothers(whole, before + for_all, after + for_all)
@@ -649,7 +648,7 @@ def multigrid(system: System) -> LinearOperator:
 
 
 def _with_held(K: csr_array, is_free: NDArray[np.float64], alone: float) -> csr_array:
-    """K with the dofs that are not free coupled to none, and `alone` on their diagonal."""
+    """K with the prescribed dofs uncoupled, and `alone` on their diagonal."""
     keep = diags_array(is_free)
     return (keep @ K @ keep + diags_array((1.0 - is_free) * alone)).tocsr()
 
@@ -672,7 +671,7 @@ def _checked_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
         young = on_curved_rule(young)
     if young.shape != (n_cells, n_places):
         raise InputError(f"young: expected one modulus for each of {n_cells} cells, got shape {young.shape}")
-    checked_young(young.min(axis=1))  # not a number in any place makes this not a number
+    checked_young(young.min(axis=1))  # any NaN makes this NaN
     checked_young(young.max(axis=1))
     return young
 
@@ -681,9 +680,9 @@ def _checked_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     """Poisson's ratios of the cells, (M,)."""
     ratios = np.asarray(nu, dtype=np.float64)
     if ratios.shape not in ((), (len(mesh.cells),)):
-        raise InputError(f"nu: expected one ratio, or one for each of {len(mesh.cells)} cells, got {ratios.shape}")
+        raise InputError(f"nu: expected one ratio or one for each of {len(mesh.cells)} cells, got shape {ratios.shape}")
     if not ((ratios > -1.0) & (ratios < 0.5)).all():
-        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue take 0.45 to 0.49")
+        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue use 0.45 to 0.49")
     return np.broadcast_to(ratios, (len(mesh.cells),))
 
 

@@ -1,4 +1,4 @@
-"""The reference that meshes are judged by: the same compression on a grid with an element to every voxel.
+"""The reference for errors of meshes: the same compression on a grid with one element per voxel.
 
 Elements are n-linear (hexahedra; quadrilaterals of plane stress in 2-D), parallelepipeds under the image's affine, each
 with its voxel's modulus. `tetopt.fem.voxels` solves them without a matrix, on millions of voxels.
@@ -33,17 +33,18 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.budget import check_memory
 
-# Of memory, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million.
+# Of memory per dof, for a solution and everything derived; 70 were measured at 27 million, 110 at 3 million.
 DOF_BYTES = 100
-INTERFACE_BAND_VOXELS = 2.0  # how near to an interface the strain there is judged
-SCALE_RESIDUAL = 1e-6  # of the homogeneous block, which only scales an error: a thousandth of the smallest
-VOXELS_AT_ONCE = 2**18  # compared, so that a volume of millions takes no more memory than its solution
+INTERFACE_BAND_VOXELS = 2.0  # distance from an interface within which its strain is compared
+SCALE_RESIDUAL = 1e-6  # for the homogeneous block, which only scales an error: 1e-3 of the smallest
+VOXELS_AT_ONCE = 2**18  # compared at a time, so that a volume of millions takes no more memory than its solution
 
 
 class OwnError(NamedTuple):
-    """How far the solution at half the resolution is from the reference's, each relative as in `Errors`.
+    """Relative differences of the solution at half the resolution from the reference's, as in `Errors`.
 
-    Where errors fall with the voxels' size, the reference's own is about as large; with its square, a third of it.
+    If errors are proportional to the voxels' size, the reference's own error is about as large; if to its square, a
+    third of it.
     """
 
     strain_energy: float
@@ -51,55 +52,55 @@ class OwnError(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """The compression of a grid of voxels; what `reference` returns."""
+    """The compression of a grid of voxels; the result of `reference`."""
 
-    modulus: Image  # kPa, the grid's elements
+    modulus: Image  # kPa, of the grid's elements
     nu: float
-    strain_energy: float  # uJ (a mm of thickness in 2-D)
+    strain_energy: float  # uJ (per mm of thickness in 2-D)
     u: NDArray[np.float64]  # (*shape + 1, n) mm, at the voxels' corners
-    u_homogeneous: NDArray[np.float64]  # the same of the block with one modulus everywhere
+    u_homogeneous: NDArray[np.float64]  # the same for the block with one modulus everywhere
     own_error: OwnError
     work: Work
 
     @property
     def n_dofs(self) -> int:
-        """Displacements of all nodes, prescribed ones too."""
+        """Number of displacements of all nodes, including prescribed ones."""
         return self.u.size
 
 
 class Errors(NamedTuple):
-    """How far a mesh's solution is from the reference's, each relative; 0 is best."""
+    """Relative errors of a mesh's solution against the reference; 0 is best."""
 
     strain_energy: float  # |E_strain - E_ref| / E_ref
-    displacement: float | None  # RMS of u - u_ref, over RMS of u_ref - u_homogeneous; None if those two are the same
+    displacement: float | None  # RMS of u - u_ref, over RMS of u_ref - u_homogeneous; None if these two are equal
     interface_strain: float | None  # RMS of the strain's error near interfaces, over RMS of the strain there
 
 
 def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
-    """Hold the box's top, push its bottom in, both bonded: `tetopt.study.paper.simulate` on the voxels.
+    """Fix the box's top and push its bottom in, both bonded: `tetopt.study.paper.simulate` on the voxels.
 
     Parameters
     ----------
     modulus : Image
         Young's modulus of each voxel, kPa, above 0.
     nu : float
-        Poisson's ratio, -1 < nu < 0.5. Near 0.5 these elements are too stiff, as linear tetrahedra are, less so.
+        Poisson's ratio, -1 < nu < 0.5. Near 0.5 these elements are too stiff, although less so than linear tetrahedra.
     percent : float
-        How far the bottom is pushed in, of the distance between the faces; see `push_of`.
+        Displacement of the bottom, in per cent of the distance between the faces; see `push_of`.
 
     Raises
     ------
     InputError
         A modulus that is not above 0, or nu out of range.
     RuntimeError
-        As `tetopt.fem.voxels.solve_voxels`.
+        As for `tetopt.fem.voxels.solve_voxels`.
     """
     if not (modulus.data > 0.0).all():
-        raise InputError(f"modulus: expected moduli above 0 kPa in every voxel, got down to {modulus.data.min():g}")
+        raise InputError(f"modulus: expected values above 0 kPa in every voxel, got as low as {modulus.data.min():g}")
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
     n_dofs = modulus.ndim * float(np.prod(np.array(modulus.shape) + 1))
-    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "ask for fewer (`reference_dofs`)")
+    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "use fewer (`reference_dofs`)")
     grid = grid_of(modulus, nu)
     push = push_of(modulus, percent)
     half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))
@@ -121,29 +122,29 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
 
 
 def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
-    """Errors of a mesh's displacements and energy against the reference, over voxel centres in the mesh.
+    """Compare a mesh's displacements and energy with the reference, over voxel centres in the mesh.
 
     Parameters
     ----------
     exact : Reference
     mesh, u, strain_energy
-        As `tetopt.fem.elasticity.compression` solved it, with the same `nu` and push; `u` of order 1 or 2, a row for
-        each node of that order. Displacement and strain are those of the cell at each voxel's centre.
+        The solution from `tetopt.fem.elasticity.compression` with the same `nu` and push; `u` has a row for each node
+        of order 1 or 2. Displacement and strain are those of the cell at each voxel's centre.
     labels : array of the image's shape
-        Materials: an interface is where a voxel's neighbour has another one. Its strain is measured at voxel centres
-        up to `INTERFACE_BAND_VOXELS` away; the error is None where there is no interface.
+        Materials: an interface is where neighbouring voxels have different ones. Its strain is compared at voxel
+        centres up to `INTERFACE_BAND_VOXELS` away; the error is None without interfaces.
 
     Raises
     ------
     InputError
-        A mesh without any voxel centre, or one of curved cells, in which no voxel's place is looked up.
+        A mesh without voxel centres, or with curved cells, for which voxels are not located.
     """
     if mesh.midpoints is not None and order_of(mesh, u) == 2:
         raise InputError("compare: expected straight edges, got a mesh with midpoints; solve Mesh(points, cells)")
     owner = cell_of_voxel(exact.modulus, mesh).ravel()
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:
-        raise InputError("mesh: no voxel centre of the reference lies in it")
+        raise InputError("mesh: no voxel centre of the reference lies inside the mesh")
     is_near = near_interface(np.asarray(labels)).ravel()
     elements, order = elements_of(mesh, order_of(mesh, u)), order_of(mesh, u)
     error, scale, size, strain_error, strain_size = np.zeros(5)
@@ -157,7 +158,7 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
         size += _squares(there)
         strain_error += _squares(_strains(elements, order, u, cell[near], places[near]) - strain[near])
         strain_size += _squares(strain[near])
-    is_homogeneous = scale <= 1e-14 * size  # all that is left is the solver's own
+    is_homogeneous = scale <= 1e-14 * size  # only the solver's error remains
     return Errors(
         abs(strain_energy / exact.strain_energy - 1.0),
         None if is_homogeneous else float(np.sqrt(error / scale)),
@@ -168,7 +169,7 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
 def at_centres(
     image: Image, u: NDArray[np.float64], voxels: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement (K, n) and strain (K, n, n) at the centres of voxels of these flat numbers, from nodes' `u`."""
+    """Displacement (K, n) and strain (K, n, n) at the centres of voxels with these flat indices, from nodes' `u`."""
     n = image.ndim
     corners = np.array(list(combinations_of((0, 1), repeat=n)))
     gradients = shape_gradients(np.full(n, 0.5), corners) @ np.linalg.inv(image.affine[:n, :n])
@@ -182,8 +183,8 @@ def at_centres(
 
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:
-    """Voxels whose centre is within `INTERFACE_BAND_VOXELS` of a facet between two labels, distances in voxels."""
-    around = ndimage.generate_binary_structure(labels.ndim, 1)  # a voxel and those that it shares a facet with
+    """Mask of voxels whose centre is within `INTERFACE_BAND_VOXELS` voxels of a facet between two labels."""
+    around = ndimage.generate_binary_structure(labels.ndim, 1)  # a voxel and its face neighbours
     is_edge = ndimage.minimum_filter(labels, footprint=around) != ndimage.maximum_filter(labels, footprint=around)
     if not is_edge.any():
         return is_edge
@@ -192,27 +193,26 @@ def near_interface(labels: NDArray) -> NDArray[np.bool_]:
 
 
 def averaged(image: Image, shape: tuple[int, ...]) -> Image:
-    """The image on a coarser grid over the same box: each new voxel is the mean over it, cut voxels by the part of
-    them.
+    """The image on a coarser grid over the same box: means over new voxels, with cut voxels weighted by their fraction.
 
     Raises
     ------
     InputError
-        Another number of axes, or more voxels along an axis than the image has.
+        A different number of axes, or more voxels along an axis than the image has.
     """
     n = image.ndim
     if len(shape) != n or any(not 1 <= c <= s for c, s in zip(shape, image.shape, strict=False)):
-        raise InputError(f"averaged: expected up to {image.shape} voxels, got {shape}")
+        raise InputError(f"averaged: expected at most {image.shape} voxels, got {shape}")
     data = block_means(image.data.astype(np.float64), shape)
     return _over_same_box(image, data)
 
 
 def refined(image: Image, shape: tuple[int, ...]) -> Image:
-    """The same field on voxels divided evenly, into about so many along each axis.
+    """The same field on evenly divided voxels, about `shape` along the axes.
 
-    Each voxel has as many parts as the others, so that means over parts of the box are those of the field. Values at
-    the centres of another grid (`nearest`) take some voxels more often: MNI152 at 2 mm, looked up at 1 mm, has a mean
-    modulus that is 0.6 % too high, which is as much as the errors that are measured.
+    All voxels have the same number of parts, so that means over parts of the box are those of the field. Values at the
+    centres of another grid (`nearest`) use some voxels more often: MNI152 at 2 mm, sampled at 1 mm, has a mean modulus
+    that is 0.6 % too high, as large as the measured errors.
     """
     data = image.data
     parts = [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)]
@@ -222,7 +222,7 @@ def refined(image: Image, shape: tuple[int, ...]) -> Image:
 
 
 def _over_same_box(image: Image, data: NDArray) -> Image:
-    """The image of other voxels that fill the same box."""
+    """An image with other voxels that fill the same box."""
     n, size = image.ndim, np.array(image.shape) / np.array(data.shape)
     scaling = np.diag([*size, 1.0])
     scaling[:n, n] = (size - 1.0) / 2.0
@@ -230,7 +230,7 @@ def _over_same_box(image: Image, data: NDArray) -> Image:
 
 
 def nearest(image: Image, grid: Image) -> Image:
-    """The image's values at the centres of another grid over the same box, each from the voxel around it."""
+    """The image's values at the centres of another grid over the same box, each from the voxel that contains it."""
     places = [
         np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.int64), old - 1)
         for new, old in zip(grid.shape, image.shape, strict=True)
@@ -241,7 +241,7 @@ def nearest(image: Image, grid: Image) -> Image:
 def _pushed(
     image: Image, grid: Grid, push: NDArray[np.float64], start: NDArray[np.float32] | None = None
 ) -> NDArray[np.float64]:
-    """Displacements with the bottom pushed in and the top at rest; between them `start`, or linear."""
+    """Displacements with the bottom pushed in and the top fixed; between them `start`, or linear."""
     u = np.zeros_like(grid.nodes()) if start is None else start.astype(np.float64)
     planes = np.moveaxis(u, 1 + grid.plates, 0)
     is_up = image.affine[image.ndim - 1, upright_axis(image.affine)] > 0.0
@@ -256,7 +256,7 @@ def _pushed(
 def _places(
     image: Image, elements: Elements, cell: NDArray[np.int64], voxels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Barycentric coordinates (K, n + 1) of the centres of voxels, each in its cell."""
+    """Barycentric coordinates (K, n + 1) of the centres of voxels in their cells."""
     n = image.ndim
     centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
     arms = centres - elements.points[elements.cells[cell, 0]]
@@ -285,5 +285,5 @@ def _squares(values: NDArray[np.float64]) -> float:
 
 
 def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Between two fields of nodes."""
+    """Euclidean distance of two fields at nodes."""
     return float(np.sqrt(sum(_squares(one - other) for one, other in zip(a, b, strict=True))))

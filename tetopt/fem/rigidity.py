@@ -1,9 +1,9 @@
-"""Rigid motions, and whether the held nodes stop all of them.
+"""Rigid motions, and a check that constraints prevent all of them.
 
-The null space of a constrained stiffness matrix is known beforehand. Without strain, cells that share a facet move as
-one rigid body; so what can move without strain are the facet-connected sets of cells, each rigidly, as long as sets
-that share a node agree there and prescribed displacements are 0. That is a small eigenvalue problem, six unknowns a
-set, and its answer can say which cells hang loose, where a solver would only return large numbers.
+The null space of a constrained stiffness matrix is known in advance. Without strain, cells that share a facet move as
+one rigid body; so the motions without strain are rigid motions of the facet-connected sets of cells such that sets that
+share a node agree there and prescribed displacements are 0. This is a small eigenvalue problem with six unknowns per
+set, whose answer identifies loose cells, where a solver would only return large numbers.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from scipy.sparse.linalg import eigsh
 from tetopt.errors import InputError
 from tetopt.geometry.topology import components, linked
 
-# The squared violation of all holds by a rigid motion of size 1: below this, which is rounding, nothing holds it.
+# Least squared violation of all constraints by a rigid motion of size 1; less is rounding, and the motion is free.
 LOOSE_VIOLATION = 1e-11
 
 
 def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid motions of the points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: shifts, then rotations.
+    """Rigid motions of points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: translations, then rotations.
 
-    Rotations are about the centre and as large as a shift by 1, in the root mean square.
+    Rotations are about the centre, with the root mean square of a translation by 1.
     """
     n = points.shape[1]
     arms = points - points.mean(axis=0)
@@ -34,7 +34,7 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Displacements (K, n, n(n+1)/2) of points with the given arms (K, n) under shifts and infinitesimal turns."""
+    """Displacements (K, n, n(n+1)/2) of points with given arms (K, n) by translations and infinitesimal rotations."""
     n = arms.shape[1]
     rows = np.zeros((len(arms), n, n * (n + 1) // 2))
     rows[:, range(n), range(n)] = 1.0
@@ -45,24 +45,22 @@ def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
-    """InputError if some part of the mesh can move without strain, for then K_ff is singular.
+    """Raise InputError if any part of the mesh can move without strain, as K_ff is singular then.
 
-    Cells (M, A) of either order, their corners first; `is_prescribed` (N, n) is true where a spring holds, too.
+    Cells (M, A) may have either order, with their corners first; `is_prescribed` (N, n) is also True for springs.
 
-    Without strain, cells that share a facet move as one rigid body. So a motion without strain is one of each
-    facet-connected set of cells such that sets that share a node agree there, and prescribed dofs rest.
+    Without strain, cells that share a facet move as one rigid body. So a motion without strain consists of rigid
+    motions of the facet-connected sets of cells such that sets that share a node agree there and prescribed dofs are 0.
     """
     is_used = np.zeros(len(points), dtype=bool)
     is_used[cells] = True
     unused = np.flatnonzero(~is_used & ~is_prescribed.all(axis=1))
     if len(unused):
-        raise InputError(
-            f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; take them out of the mesh"
-        )
+        raise InputError(f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; remove them")
     if not is_prescribed.any():
         raise InputError(
-            "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
-            "hold:SET and spring:SET:K do"
+            "mesh: it can move freely, as no displacement or spring constrains it; fix or support at least one set, "
+            "as hold:SET and spring:SET:K do"
         )
     body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
@@ -70,13 +68,13 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
     if weakest < LOOSE_VIOLATION:
         inside = np.flatnonzero(body == loose)
         raise InputError(
-            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still turn or slide "
-            "as a whole, they hang by too few nodes; hold more nodes or keep the largest facet-connected set"
+            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still rotate or slide "
+            "as a whole: too few nodes connect them; fix more nodes or keep the largest facet-connected set"
         )
 
 
 def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
-    """InputError if a connected component of the mesh, cells linked by nodes, has no prescribed dof."""
+    """Raise InputError if a component of cells connected by nodes has no prescribed dof."""
     n_bodies = int(body.max()) + 1
     bodies = np.repeat(body, cells.shape[1]) + len(is_prescribed)
     label = linked(cells.ravel(), bodies, len(is_prescribed) + n_bodies)[1][: len(is_prescribed)]
@@ -86,15 +84,15 @@ def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescrib
         piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
-            f"mesh: {n_pieces} components have no node that is held, pushed or on a spring, the first has {len(piece)} "
-            f"cells around cell {piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
+            f"mesh: {n_pieces} components have no node that is fixed, displaced or on a spring; the first has "
+            f"{len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); fix it or remove it"
         )
 
 
 def _weakest_hold(
     points: NDArray[np.float64], cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Smallest sum of squared violations by a rigid motion of the bodies of size 1, and the body that it moves most."""
+    """Smallest sum of squared violations by a rigid motion of size 1 of the bodies, and the body that it moves most."""
     n = points.shape[1]
     incidence = np.unique(cells * (int(body.max()) + 1) + body[:, None])
     node, of_body = np.divmod(incidence, int(body.max()) + 1)
@@ -108,7 +106,7 @@ def _weakest_hold(
     is_first = np.concatenate([[True], node[1:] != node[:-1]])
 
     def spread(which: NDArray[np.int64]) -> csr_array:
-        """One row for each component of the given incidences: its displacement by the bodies' motions."""
+        """Displacements of the given incidences by the bodies' motions, one row per component."""
         column = of_body[which, None, None] * r + np.arange(r)
         at = (np.arange(len(which))[:, None] * n + np.arange(n))[:, :, None]
         at, column = np.broadcast_arrays(at, column)

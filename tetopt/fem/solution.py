@@ -1,10 +1,10 @@
-"""What becomes of a model: displacements, strains and stresses, energies, reactions.
+"""The solution of a model: displacements, strains, stresses, energies, reactions.
 
-Each step of a model is one linear problem, from the undeformed state. What acts on facets acts on nodes by the weights
-of `tetopt.model.loads.facet_weights`, which the files for other solvers have, too, so that all of them solve the same
+Each step of a model is one linear problem, from the undeformed state. Loads on facets act on nodes by the weights of
+`tetopt.model.loads.facet_weights`, which files for other solvers use, too, so that all of them solve the same
 equations.
 
-Half of the work of all forces on their way is what the body and the springs around it store (Clapeyron's theorem):
+Body and springs store half the product of all forces and their displacements (Clapeyron's theorem):
 
     strain energy + energy of the springs = 1/2 (forces . u + reactions . prescribed u).
 """
@@ -39,36 +39,36 @@ from tetopt.model.materials import density_of
 from tetopt.model.model import Model, element_facets, elements, in_units
 
 KG_PER_MM3 = 1e-9  # in a kg/m3
-BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: what is lost to rounding in a sum of forces
+BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: rounding error in a sum of forces
 
 
 class Solution(NamedTuple):
-    """One step of a model, solved, in mm, kPa, mN and uJ (in 2-D by mm of thickness) and the model's axes.
+    """Solution of one step of a model, in mm, kPa, mN and uJ (in 2-D per mm of thickness) and the model's axes.
 
     Parameters
     ----------
     u : (N, n) float64
-        Displacement, mm, a row a node of the model's order.
+        Displacement, mm, one row per node of the model's order.
     young : (M, Q) float64
-        kPa, at the Gauss points.
+        Young's modulus at the Gauss points, kPa.
     strain : (M, Q, n, n) float64
-        At the Gauss points.
+        Strain at the Gauss points.
     stress : (M, Q, n, n) float64
-        At the Gauss points, kPa, in 2-D in the plane.
+        Stress at the Gauss points, kPa, in 2-D in the plane.
     strain_energy : float
-        In the cells, uJ.
+        Energy in the cells, uJ.
     spring_energy : float
-        In the springs, uJ.
+        Energy in the springs, uJ.
     work : float
-        Half of forces on their way, prescribed ones with them, uJ: the sum of the two energies.
+        Half the product of forces, including reactions, and displacements, uJ: the sum of the two energies.
     reactions : dict of (n,) float64
-        By set that is prescribed or on springs, what holds it there, mN.
+        Force of the support or springs on each set that has any, mN.
     applied : (n,) float64
-        The sum of pressures, tractions and gravity, mN; the reactions balance it.
+        Sum of pressures, tractions and gravity, mN; the reactions balance it.
     n_iterations : int
-        Of conjugate gradients, 0 where the matrix was factorised.
+        Number of conjugate gradient steps, 0 if the matrix was factorised.
     system : System
-        As it was solved, for `tetopt.fem.conditioning`.
+        The solved system, for `tetopt.fem.conditioning`.
 
     Examples
     --------
@@ -99,21 +99,21 @@ class _Task(NamedTuple):
 
     is_prescribed: NDArray[np.bool_]  # (N, n)
     prescribed: NDArray[np.float64]  # (N, n) mm
-    of_set: dict[str, NDArray[np.bool_]]  # (N, n) which of them a set prescribes
+    of_set: dict[str, NDArray[np.bool_]]  # (N, n) mask of the dofs that a set prescribes
     outside: Outside
-    springs: dict[str, NDArray[np.float64]]  # (N,) mN/mm of each set
+    springs: dict[str, NDArray[np.float64]]  # (N,) mN/mm, by set
 
 
 @on_one_blas_thread
 def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
-    """The displacements of one step, and what follows from them.
+    """Solve one step for displacements, strains, stresses, energies and reactions.
 
     Parameters
     ----------
     model : Model
-        With moduli: of its materials, or, where it has them, those at the nodes, linear within each cell.
+        A model with moduli: those of its materials, or, if given, those at the nodes, linear within each cell.
     step : int
-        From 1. Loads of no step are in all of them.
+        Number of the step, from 1. Loads without a step belong to all steps.
     method : {"auto", "direct", "amg"}
         See `tetopt.fem.elasticity.solved`.
 
@@ -125,15 +125,15 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     Raises
     ------
     InputError
-        No moduli, no such step, gravity without a density, another kind of load, or something that could move without
-        being strained, as no load holds it.
+        No moduli, no such step, gravity without a density, an unknown kind of load, or a part that can move without
+        strain, as no load constrains it.
     RuntimeError
-        Not solved, or forces and reactions do not balance, as for moduli that differ too much.
+        No solution, or forces and reactions do not balance, as may happen if moduli differ too much.
 
     See Also
     --------
-    build_model : Makes a model.
-    solution_fields : What goes into a mesh's file.
+    build_model : Make a model.
+    solution_fields : Convert a solution to fields for a mesh's file.
 
     Examples
     --------
@@ -160,7 +160,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     if not 1 <= step <= n_steps:
         raise InputError(f"step: expected 1 to {n_steps}, got {step}")
     if model.materials is None:
-        raise InputError("model: its cells have no moduli; give `young`")
+        raise InputError("model: the cells have no moduli; give `young`")
     task = _task(model, in_step(model.loads, step))
     young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
     system = constrained(
@@ -171,7 +171,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     stress = _stress(strain, young, nu)
     strain_energy = 0.5 * float((gauss_volumes(model.mesh, model.order) * (strain * stress).sum(axis=(2, 3))).sum())
     pull = -task.outside.springs[:, None] * u
-    # K has the springs, whose pull is thus on the body's side: what is left over is the supports'.
+    # K includes the springs, so their forces count as the body's, and the remainder is the supports'.
     reaction = (system.K @ u.ravel()).reshape(u.shape) - task.outside.forces
     _check_balance(system, task, reaction, pull, u)
     reactions = {name: np.where(where, reaction, 0.0).sum(axis=0) for name, where in task.of_set.items()}
@@ -188,7 +188,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
 def gauss_moduli(model: Model) -> NDArray[np.float64]:
     """Modulus at the Gauss points of the model's order, (M, Q), in its unit of stress.
 
-    That of each cell's material; or, of moduli at the nodes, the linear interpolation; or the model's own there.
+    From each cell's material, from linear interpolation of moduli at the nodes, or from the model's own Gauss values.
     """
     is_curved = model.mesh.midpoints is not None and model.order == 2
     if model.gauss_young is not None:
@@ -201,7 +201,7 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
 
 
 def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stress (M, Q, n, n), kPa, of strains, moduli (M, Q) and ratios (M,); in 2-D plane stress."""
+    """Stress (M, Q, n, n), kPa, from strains, moduli (M, Q) and ratios (M,); in 2-D plane stress."""
     n = strain.shape[-1]
     lame, mu = lame_constants(young, nu[:, None], n)
     spread = lame * np.einsum("cqii->cq", strain)
@@ -222,7 +222,7 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
     for load in loads:
         if load.kind == "displacement":
             where = np.zeros(points.shape, dtype=bool)
-            # By facets, not by pairs of nodes: an edge between two nodes of a set may leave it.
+            # By facets, not by pairs of nodes, as an edge between two nodes of a set may leave it.
             where[np.unique(element_facets(cells, model.sets.facets[load.set_name]))] = ~np.isnan(load.numbers)
             task.is_prescribed[where] = True
             task.prescribed[where] = np.broadcast_to(load.numbers, where.shape)[where]
@@ -246,12 +246,12 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
 def weight_forces(
     mesh: Mesh, density: NDArray[np.float64], acceleration: NDArray[np.float64], order: int
 ) -> NDArray[np.float64]:
-    """What a uniform acceleration (n,), mm/s2, of cells of a density (M,), kg/m3, does to each node, (N, n) mN.
+    """Forces on nodes, (N, n) mN, from a uniform acceleration (n,), mm/s2, of cells with a density (M,), kg/m3.
 
-    Each node of a cell gets the integral of its shape function: with order 1 as much as the others; with order 2 a
-    triangle's weight goes to the middles of its edges alone, and of a tetrahedron's a fifth to each of these and -1/20
-    to each corner (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces). In a
-    curved cell the integral is taken by its Gauss points.
+    Each node of a cell gets the integral of its shape function. For order 1 all nodes get the same; for order 2 a
+    triangle's weight goes only to its mid-edge nodes, and a tetrahedron's to these (1/5 each) and its corners (-1/20
+    each) (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces). A curved cell is
+    integrated at its Gauss points.
     """
     n = mesh.ndim
     points, cells = of_order(mesh.points, mesh.cells, order)
@@ -272,9 +272,9 @@ def weight_forces(
 def _check_balance(
     system: System, task: _Task, reaction: NDArray[np.float64], pull: NDArray[np.float64], u: NDArray[np.float64]
 ) -> None:
-    """RuntimeError unless reactions, forces and springs cancel: their sum, and their moments about any axis.
+    """Raise RuntimeError unless reactions, forces and springs cancel in their sum and moments about any axis.
 
-    The work of all of them on each rigid motion, of root mean square 1, is that of the residual at the free nodes.
+    Their total work on each rigid motion, of root mean square 1, is that of the residual at the free nodes.
     """
     total = np.where(task.is_prescribed, reaction, 0.0) + task.outside.forces + pull
     left = float(np.abs(system.modes.T @ total.ravel()).max())
@@ -283,7 +283,7 @@ def _check_balance(
     allowed = size * (residual + BALANCE_ROUNDING * float(system.K.diagonal() @ np.abs(u.ravel())))
     if not left <= allowed:
         raise RuntimeError(
-            f"elasticity: forces and reactions do not balance, {left:.3g} mN are left where {allowed:.3g} may be"
+            f"elasticity: forces and reactions do not balance: the remainder {left:.3g} mN exceeds {allowed:.3g} mN"
         )
 
 
@@ -291,22 +291,22 @@ def _check_balance(
 
 
 def von_mises(stress: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The equivalent stress of von Mises of stresses (..., n, n); in 2-D plane stress."""
+    """Von Mises stress of stresses (..., n, n); in 2-D plane stress."""
     spread = np.einsum("...ii->...", stress)
     return np.sqrt(np.maximum(1.5 * ((stress**2).sum(axis=(-2, -1)) - spread**2 / 3.0), 0.0))
 
 
 def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values at Gauss points (M, Q, ...) brought to the nodes of the order that has Q of them, (N, ...).
+    """Extrapolate values at Gauss points (M, Q, ...) to the nodes of the order with Q points, (N, ...).
 
-    Within a cell they are linear, which is what strains of order 2 are, or, at the points of a curved cell, the linear
-    ones of least squares; a node has the mean by (straight) volume over the cells around it.
+    Within a cell they are linear, like strains of order 2, or fitted by least squares in a curved cell. A node has the
+    mean over the cells around it, weighted by (straight) volume.
     """
     n, n_places = mesh.ndim, values.shape[1]
     order = 1 if n_places == 1 else 2
     cells = of_order(mesh.points, mesh.cells, order)[1]
     if order == 2:
-        # (n+1, Q): linear values are those at the corners, weighted.
+        # (n+1, Q): linear values are weighted means of those at the corners.
         places = gauss_rule(n, 2, is_curved=n_places > n + 1)[0]
         at_corners = np.linalg.inv(places) if len(places) == n + 1 else np.linalg.pinv(places)
         at_nodes = np.concatenate([at_corners, at_corners[cell_edges(n)].mean(axis=1)])
@@ -323,14 +323,14 @@ def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class SolutionFields(NamedTuple):
-    """What a solution puts on a mesh's file, by name.
+    """Fields of a solution for a mesh's file, by name.
 
     Parameters
     ----------
     cell_data : dict of (M, ...) float64
-        By name, a row a cell.
+        Fields with one row per cell.
     point_data : dict of (N, ...) float64
-        By name, a row a node of the order.
+        Fields with one row per node of the order.
 
     Examples
     --------
@@ -349,29 +349,29 @@ class SolutionFields(NamedTuple):
 
 @on_one_blas_thread
 def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFields:
-    """Displacement, strain and stress of a solution, on cells (means) and nodes, for a mesh's file.
+    """Convert displacement, strain and stress to fields on cells (means) and nodes, for a mesh's file.
 
-    Displacement in mm, strain, stress and von Mises stress in kPa; tensors row by row. Names of steps after the first
-    end in "_step2" and so on.
+    Displacement is in mm; stress and von Mises stress are in kPa; tensors are stored row by row. Names for steps after
+    the first end in "_step2" and so on.
 
     Parameters
     ----------
     mesh : Mesh
-        Of the model.
+        The model's mesh.
     solution : Solution
-        Of one step of it.
+        Solution of one of its steps.
     step : int
-        Which one, from 1.
+        Number of the step, from 1.
 
     Returns
     -------
     SolutionFields
-        By name, as `save_mesh` takes them.
+        Fields by name, for `save_mesh`.
 
     Raises
     ------
     InputError
-        A mesh or a step that is none.
+        An invalid mesh or step.
 
     Examples
     --------

@@ -1,13 +1,13 @@
-"""Products with the stiffness of a grid of voxels, no matrix stored, and what a multigrid cycle on it needs besides.
+"""Matrix-free products with the stiffness of a grid of voxels, and the other kernels of a multigrid cycle.
 
-All elements have one shape, so that the stiffness is one element matrix times each voxel's modulus. Sums and
-differences of the corners along each axis turn that matrix into one with few entries: the derivatives of the n-linear
-functions 1, x, y, xy, ... about the voxel's centre are orthogonal to each other unless they are the same. Of 576
-entries of a hexahedron 45 are left if the axes are at right angles, 167 if not.
+All elements have the same shape, so that the stiffness is one element matrix times each voxel's modulus. Sums and
+differences of the corners along each axis make that matrix sparse: the derivatives of the n-linear functions 1, x, y,
+xy, ... about the voxel's centre are orthogonal unless they are equal. Of a hexahedron's 576 entries 45 remain if the
+axes are at right angles, 167 otherwise.
 
-Fields of nodes are (n, I, J, K), component by component, and moduli (I - 1, J - 1, K - 1); in 2-D the middle axis has
-length 1 in both. Work goes row by row along the last axis. Slabs of planes are taken in two turns, those of a turn
-at the same time, and every sum goes plane by plane, so that results are the same on any number of threads.
+Fields at nodes are (n, I, J, K), component by component, and moduli (I - 1, J - 1, K - 1); in 2-D the middle axis has
+length 1 in both. Work proceeds row by row along the last axis. Slabs of planes are processed in two turns, in parallel
+within each turn, and sums are taken plane by plane, so that results are the same on any number of threads.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import few_threads
 from tetopt.system.kernel_cache import njit
 
-CHUNK_VOXELS = 128  # of a row at once: 48 rows of them stay in the first cache
-SLAB_PLANES = 4  # a plane in this many is written by two slabs; more planes leave threads idle at the end
-VOXELS_PER_TASK = 32  # as `few_threads` counts: a voxel takes some 20 ns, and waking a thread up to 1 ms if others run
+CHUNK_VOXELS = 128  # of a row at a time: 48 such rows fit into the first-level cache
+SLAB_PLANES = 4  # two slabs write to one plane in this many; more planes leave threads idle at the end
+VOXELS_PER_TASK = 32  # for `few_threads`: a voxel takes about 20 ns, and waking a thread up to 1 ms if others run
 
 
 class Terms(NamedTuple):
@@ -37,15 +37,15 @@ class Terms(NamedTuple):
 class Transfer(NamedTuple):
     """Linear interpolation along one axis, from coarse nodes to fine ones."""
 
-    left: NDArray[np.int64]  # of each fine node, the coarse nodes around it
+    left: NDArray[np.int64]  # (fine + 1,) coarse node to the left of each fine node
     right: NDArray[np.int64]
-    weight: NDArray[np.float32]  # of the right one
-    begin: NDArray[np.int64]  # of each coarse node, the fine nodes that it has a part in: begin to end
+    weight: NDArray[np.float32]  # weight of the right coarse node
+    begin: NDArray[np.int64]  # range of fine nodes to which each coarse node contributes: begin to end
     end: NDArray[np.int64]
 
 
 def element_terms(element: NDArray[np.float64]) -> Terms:
-    """What is left of an element's stiffness (2^n, 2^n, n, n) between sums and differences of its corners."""
+    """Entries of an element's stiffness (2^n, 2^n, n, n) between sums and differences of its corners."""
     n = element.shape[2]
     H = np.ones((1, 1))
     for _ in range(n):
@@ -56,8 +56,8 @@ def element_terms(element: NDArray[np.float64]) -> Terms:
 
 
 def transfer(fine: int, coarse: int) -> Transfer:
-    """Between two numbers of voxels along the same side of the box; 0 stands for the axis that 2-D lacks."""
-    place = np.arange(fine + 1) * coarse / max(fine, 1)  # whole numbers stay whole
+    """Transfer between two numbers of voxels along the same side of the box; 0 stands for the axis missing in 2-D."""
+    place = np.arange(fine + 1) * coarse / max(fine, 1)  # exact for whole numbers
     left = np.minimum(np.floor(place), max(coarse - 1, 0)).astype(np.int64)
     right = np.minimum(left + 1, coarse)
     weight = (place - left).astype(np.float32)
@@ -66,13 +66,13 @@ def transfer(fine: int, coarse: int) -> Transfer:
 
 
 def add_product(out: NDArray, u: NDArray, young: NDArray, terms: Terms) -> None:
-    """Add the stiffness times `u` to `out`, both (n, I, J, K) of one dtype, as `young` and the terms' values."""
+    """Add the stiffness times `u` to `out`, both (n, I, J, K), of the same dtype as `young` and the terms' values."""
     with few_threads(young.size // VOXELS_PER_TASK):
         _add_product(out, u, young, terms.row, terms.column, terms.value)
 
 
 def product(a: NDArray, b: NDArray) -> float:
-    """The inner product of two fields of nodes, in double precision."""
+    """Inner product of two fields at nodes, in double precision."""
     with few_threads(a.size // VOXELS_PER_TASK):
         return float(_products(a, b).sum())
 
@@ -84,7 +84,7 @@ def smooth(d: NDArray, x: NDArray, r: NDArray, weight: NDArray, scale: NDArray, 
 
 
 def restrict(coarse: NDArray, fine: NDArray, ways: tuple[Transfer, ...]) -> None:
-    """Fill `coarse` with the transposed interpolation of `fine`; a way for each of three axes."""
+    """Fill `coarse` with the transposed interpolation of `fine`; `ways` has a transfer for each of three axes."""
     i, j, k = ways
     with few_threads(fine[0].size // VOXELS_PER_TASK):
         _restrict(coarse, fine, i, j, k)
@@ -98,13 +98,13 @@ def prolong(d: NDArray, x: NDArray, coarse: NDArray, ways: tuple[Transfer, ...])
 
 
 def advance(x: NDArray, r: NDArray, p: NDArray, q: NDArray, alpha: float) -> float:
-    """A step of conjugate gradients: x grows by alpha p, r falls by alpha q; the square of r's norm."""
+    """Do a step of conjugate gradients: add alpha p to x, subtract alpha q from r; return the square of r's norm."""
     with few_threads(x.size // VOXELS_PER_TASK):
         return float(_advance(x, r, p, q, alpha).sum())
 
 
 def turn(p: NDArray, z: NDArray, beta: float) -> None:
-    """The next direction of conjugate gradients: p becomes z + beta p."""
+    """Set the next direction of conjugate gradients: p becomes z + beta p."""
     with few_threads(p.size // VOXELS_PER_TASK):
         _turn(p, z, beta)
 
@@ -167,7 +167,7 @@ def _modes(modes: NDArray, u: NDArray, i: int, j: int, k: int, width: int) -> No
 
 @njit(cache=True)
 def _add_forces(out: NDArray, forces: NDArray, i: int, j: int, k: int, width: int) -> None:
-    """The transpose of `_modes`, added to the nodes; overwrites `forces`."""
+    """Add the transpose of `_modes` to the nodes; overwrites `forces`."""
     n = out.shape[0]
     for axis in range(1, n):
         for m in range(2**n):
@@ -207,7 +207,7 @@ def _multiply(out: NDArray, a: NDArray, width: int) -> None:
 
 @njit(cache=True, parallel=True)
 def _products(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """Of each plane."""
+    """Inner product of each plane."""
     sums = np.zeros(a.shape[1])
     for i in prange(a.shape[1]):
         lanes = np.zeros(a.shape[3])

@@ -1,17 +1,18 @@
-"""Linear elasticity on a grid with an element to every voxel, solved without any matrix.
+"""Matrix-free linear elasticity on a grid with one element per voxel.
 
-Conjugate gradients in double precision, preconditioned by one V-cycle of geometric multigrid in single precision.
+The solver is conjugate gradients in double precision, preconditioned by a V-cycle of geometric multigrid in single
+precision.
 
 - Coarse grids fill the same box with half the voxels along an axis, rounded up, so that its sides, and the plates on
-  two of them, stay where they are; their voxels are as much larger, and nodes need not coincide. Axes whose voxels are
-  twice as long as the shortest wait until the others have caught up. A coarse voxel's modulus is the mean over it.
+  two of them, stay in place; their voxels are larger accordingly, and nodes need not coincide. Axes whose voxels are
+  twice as long as the shortest are not coarsened until the others have caught up. A coarse voxel has the mean modulus.
 - Interpolation is linear along each axis, restriction its transpose.
 - The smoother is a Chebyshev polynomial of the fourth kind (J. Lottes, Optimal polynomial smoothers for multigrid
   V-cycles, Numer. Linear Algebra Appl. 30, e2518, 2023) in D^-1 A, where D is the diagonal of A, in sheared grids up to
-  the signs of the corners. It needs the largest eigenvalue alone, and no element's is above that of the element of
-  modulus 1, whatever the moduli: sum x^T A_e x <= lambda sum x^T D_e x. The same polynomial before and after makes the
-  cycle symmetric.
-- The last grid has a hundred unknowns or fewer and is inverted.
+  the signs of the corners. It needs only the largest eigenvalue, which for any moduli is at most that of the element of
+  modulus 1: sum x^T A_e x <= lambda sum x^T D_e x. Using the same polynomial before and after makes the cycle
+  symmetric.
+- The last grid has at most a hundred unknowns and is inverted.
 """
 
 from __future__ import annotations
@@ -40,24 +41,24 @@ from tetopt.fem.voxel_kernels import (
 from tetopt.geometry.box import upright_axis
 from tetopt.image import Image
 
-SMOOTHING_STEPS = 2  # products before and as many after the coarser grid
-DENSE_UNKNOWNS = 100  # up to which a grid is the last one: so few that LAPACK never divides the work among threads
+SMOOTHING_STEPS = 2  # products before the coarser grid, and as many after it
+DENSE_UNKNOWNS = 100  # up to which a grid is the last one: few enough that LAPACK never uses several threads
 ITERATION_LIMIT = 1000  # moduli over four orders of magnitude take a hundred
 LONG_VOXEL = 2.0  # an axis with voxels this much longer than the shortest is not coarsened yet
 
 
 class Grid(NamedTuple):
-    """A box of voxels between two plates, the longest axis last; in 2-D a middle axis of length 1 is put in."""
+    """A box of voxels between two plates, the longest axis last; 2-D gets a middle axis of length 1."""
 
     young: NDArray[np.float64]  # (I, J, K) kPa
     jacobian: NDArray[np.float64]  # (n, n) index axes to mm, columns in the order of the axes
     nu: float
-    plates: int  # axis of `young` that the two plates lie across
-    order: tuple[int, ...]  # the image's axis of each axis
+    plates: int  # axis of `young` across which the two plates lie
+    order: tuple[int, ...]  # axis of the image for each axis
 
     @property
     def axes(self) -> list[int]:
-        """Those of `young` that are the image's."""
+        """Axes of `young` that are the image's."""
         return [0, 2] if len(self.order) == 2 else [0, 1, 2]
 
     def nodes(self) -> NDArray[np.float64]:
@@ -66,12 +67,12 @@ class Grid(NamedTuple):
         return np.zeros((n, *(s + 1 if axis in self.axes else 1 for axis, s in enumerate(self.young.shape))))
 
     def in_image(self, u: NDArray) -> NDArray:
-        """A field of nodes as the image has its axes, (*shape + 1, n); a view."""
+        """A field at nodes in the order of the image's axes, (*shape + 1, n); a view."""
         only = u if len(self.order) == 3 else u[:, :, 0]
         return np.moveaxis(only.transpose(0, *(1 + np.argsort(self.order))), 0, -1)
 
     def coarsened(self, shape: tuple[int, ...]) -> Grid:
-        """The same box in fewer voxels, (I, J, K); moduli are means."""
+        """The same box with fewer voxels, (I, J, K), and mean moduli."""
         ratio = (np.array(self.young.shape) / np.array(shape))[self.axes]
         return self._replace(young=block_means(self.young, shape), jacobian=self.jacobian * ratio)
 
@@ -80,10 +81,10 @@ class Level(NamedTuple):
     """One grid of the hierarchy; fields are (n, I + 1, J + 1, K + 1), the middle one 1 in 2-D."""
 
     young: NDArray[np.float32]
-    terms: Terms  # of -A, so that a product takes A d away from the residual
+    terms: Terms  # of -A, so that a product subtracts A d from the residual
     weight: NDArray[np.float32]  # (I + 1, ...) 1 / sum of the moduli around each node, 0 on the plates
     scale: NDArray[np.float32]  # (n,) 1 / (the element's diagonal times the largest eigenvalue)
-    ways: tuple[Transfer, ...]  # to the next grid; none from the last
+    ways: tuple[Transfer, ...]  # transfers to the next grid; empty for the last
     r: NDArray[np.float32]  # residual
     x: NDArray[np.float32]  # solution
     d: NDArray[np.float32]  # the last step
@@ -93,16 +94,16 @@ class Hierarchy(NamedTuple):
     """All grids of the preconditioner, from fine to coarse."""
 
     levels: list[Level]
-    inverse: NDArray[np.float64]  # of the last grid's free unknowns
+    inverse: NDArray[np.float64]  # inverse for the last grid's free unknowns
     free: NDArray[np.int64]  # their places in its ravelled fields
     plates: int
 
 
 class Work(NamedTuple):
-    """What a solution took."""
+    """Iterations and residual of a solution."""
 
     iterations: int
-    residual: float  # over the load
+    residual: float  # relative to the load
 
 
 def grid_of(modulus: Image, nu: float) -> Grid:
@@ -119,12 +120,12 @@ def grid_of(modulus: Image, nu: float) -> Grid:
 def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
     """Stiffness of one element of modulus 1 between its corners, (2^n, 2^n, n, n); corners as `product((0, 1), ...)`.
 
-    `jacobian` (n, n) takes a voxel's index axes to mm. By Gauss's rule of two points along each axis, exact here.
+    `jacobian` (n, n) maps a voxel's index axes to mm. Gauss's rule with two points along each axis is exact here.
     """
     n = len(jacobian)
     corners = np.array(list(combinations_of((0, 1), repeat=n)))
     lame_1, mu = (float(constant[0]) for constant in lame_constants(np.ones(1), nu, n))
-    size = abs(float(np.linalg.det(jacobian))) / 2**n  # of each Gauss point's part
+    size = abs(float(np.linalg.det(jacobian))) / 2**n  # volume of each Gauss point
     K = np.zeros((2**n, 2**n, n, n))
     for sign in combinations_of((-1.0, 1.0), repeat=n):
         at = 0.5 + np.array(sign) / np.sqrt(12.0)
@@ -152,21 +153,21 @@ def stiffness_product(grid: Grid, u: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_fraction: float = RESIDUAL_FRACTION) -> Work:
-    """Turn the displacements `u` between the plates into those without forces; those on the plates stay as they are.
+    """Solve for the displacements `u` between the plates without forces; displacements of the plates stay fixed.
 
     Parameters
     ----------
     grid : Grid
         Moduli above 0.
     u : field of nodes
-        mm, world, with the plates' displacements; what is between them is where the iteration begins. Overwritten.
+        mm, world, with the plates' displacements; values between them start the iteration. Overwritten.
     residual_fraction : float
-        Residual over load that it goes down to; the load is what the plates alone do to the nodes next to them.
+        Target residual over load, where the load is the plates' force on the nodes next to them.
 
     Raises
     ------
     RuntimeError
-        The residual stayed ten times above that, as it may for moduli over more than six orders of magnitude.
+        The residual stayed above ten times that, as it may if moduli differ by more than six orders of magnitude.
     """
     plates = grid.plates
     if grid.young.shape[plates] == 1:
@@ -195,8 +196,7 @@ def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_fraction: float = 
     residual = _norm(_free(q, plates))
     if not residual <= 10.0 * residual_fraction * load:
         raise RuntimeError(
-            f"reference: not solved, the residual is {residual:.3g} mN where {10.0 * residual_fraction * load:.3g} may "
-            f"be"
+            f"reference: not solved, the residual {residual:.3g} mN exceeds {10.0 * residual_fraction * load:.3g} mN"
         )
     return Work(iterations, residual / load)
 
@@ -209,13 +209,13 @@ def interpolated(u: NDArray[np.float64], coarse: Grid, fine: Grid) -> NDArray[np
 
 
 def _ways(grid: Grid, shape: tuple[int, ...]) -> tuple[Transfer, ...]:
-    """From a grid of that shape to `grid`."""
+    """Transfers from a grid of that shape to `grid`."""
     pairs = enumerate(zip(grid.young.shape, shape, strict=True))
     return tuple(transfer(fine, coarse) if axis in grid.axes else transfer(0, 0) for axis, (fine, coarse) in pairs)
 
 
 def multigrid_of(grid: Grid) -> Hierarchy:
-    """The grids of the preconditioner, moduli over their largest."""
+    """The grids of the preconditioner, with moduli relative to the largest."""
     grid = grid._replace(young=grid.young / grid.young.max())
     levels: list[Level] = []
     while True:
@@ -239,7 +239,7 @@ def coarser(grid: Grid) -> tuple[int, ...]:
 
 
 def block_means(data: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Means over the voxels of a coarser grid on the same box, cut voxels by the part of them."""
+    """Means over the voxels of a coarser grid on the same box, with cut voxels weighted by their fraction."""
     for axis, (new, old) in enumerate(zip(shape, data.shape, strict=True)):
         if new != old:
             rows = np.moveaxis(data, axis, 0)
@@ -249,7 +249,7 @@ def block_means(data: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np
 
 
 def _fractions(new: int, old: int) -> csr_array:
-    """How much of each new voxel's length is of each old one, (new, old)."""
+    """Fraction of each new voxel's length in each old one, (new, old)."""
     ends = np.union1d(np.arange(new + 1) * old / new, np.arange(old + 1.0))
     middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
     row = np.minimum((middle * new / old).astype(np.int64), new - 1)
@@ -288,7 +288,7 @@ def _inverse(level: Level, free: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def preconditioned(hierarchy: Hierarchy, residual: NDArray[np.float64], size: float) -> NDArray[np.float32]:
-    """One V-cycle for the residual, over its `size`, lest single precision is left; an array of the hierarchy's own."""
+    """One V-cycle for the residual over its `size`, to stay in range of single precision; an array of the hierarchy."""
     finest = hierarchy.levels[0]
     np.divide(residual, size, out=finest.r, casting="unsafe")
     _cycle(hierarchy, 0)
@@ -296,7 +296,7 @@ def preconditioned(hierarchy: Hierarchy, residual: NDArray[np.float64], size: fl
 
 
 def _cycle(hierarchy: Hierarchy, depth: int) -> None:
-    """From `r` of a level to its `x`; `r` is used up."""
+    """Compute `x` of a level from its `r`, which is overwritten."""
     level = hierarchy.levels[depth]
     if depth == len(hierarchy.levels) - 1:
         level.x.ravel()[hierarchy.free] = (hierarchy.inverse * level.r.ravel()[hierarchy.free]).sum(axis=1)
@@ -315,7 +315,7 @@ def _cycle(hierarchy: Hierarchy, depth: int) -> None:
 
 
 def chebyshev_factors(k: int) -> tuple[float, float]:
-    """Of the last step and of D^-1 r / lambda in step k of Lottes' Algorithm 1, k from 0."""
+    """Factors of the last step and of D^-1 r / lambda in step k of Lottes' Algorithm 1, k from 0."""
     return (2.0 * k - 1.0) / (2.0 * k + 3.0) if k else 0.0, (8.0 * k + 4.0) / (2.0 * k + 3.0)
 
 

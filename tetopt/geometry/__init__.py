@@ -1,1 +1,1 @@
-"""Closed forms on arrays of points and simplices; knows nothing of images."""
+"""Closed forms on arrays of points and simplices, independent of images."""

@@ -1,4 +1,4 @@
-"""The box of an image: its sides, which of them a place is on, and which of its axes stands for which of the world's.
+"""The box of an image: its sides, the places on them, and the correspondence of its axes to the world's.
 
 Index coordinates: voxel centres are whole numbers, so that the box runs from -0.5 to s - 0.5 along an axis of s voxels.
 """
@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# A place this near to a side lies on it. Reading a file and turning its points to index coordinates moves them by some
-# 1e-12 voxel (1e-7 of the coordinate in mm where a file holds float32), and no mesh has cells as thin as this.
+# A place this near to a side lies on it. Reading a file and converting its points to index coordinates moves them by
+# some 1e-12 voxel (1e-7 of the coordinate in mm where a file holds float32), and no mesh has cells as thin as this.
 ON_SIDE_VOXELS = 1e-6
 
 
 def box_sides(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Where the two sides across each axis lie, (n, 2) index coordinates."""
+    """Index coordinates of the two sides across each axis, (n, 2)."""
     return np.column_stack([np.full(len(shape), -0.5), np.array(shape) - 0.5])
 
 
 def is_on_sides(places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS) -> NDArray[np.bool_]:
-    """Whether places (..., n) lie on each of the sides (n, 2) of a box, (..., n, 2); exactly if `tolerance` is 0.
+    """True where places (..., n) lie on the sides (n, 2) of a box, (..., n, 2); exactly if `tolerance` is 0.
 
     Examples
     --------
@@ -35,7 +35,7 @@ def is_on_sides(places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON
 def facets_on_sides(
     places: NDArray[Any], nodes: NDArray[np.int64], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS
 ) -> NDArray[np.bool_]:
-    """Whether facets `nodes` (F, n) of places (N, n) lie on each of the sides with all of their nodes, (F, n, 2)."""
+    """True where all nodes of facets `nodes` (F, n), at places (N, n), lie on a side, (F, n, 2)."""
     is_on: NDArray[np.bool_] = np.all(is_on_sides(places, sides, tolerance)[nodes], axis=1)
     return is_on
 
@@ -46,9 +46,9 @@ def upright_axis(affine: NDArray[np.float64]) -> int:
 
 
 def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
-    """The world axis that each index axis stands for, each one once.
+    """The world axis that corresponds to each index axis; each occurs once.
 
-    The last world axis goes to `upright_axis`, the others to those that they lie nearest to together.
+    The last world axis belongs to `upright_axis`; the others are assigned for the best overall alignment.
     """
     cosines, up = _cosines(affine), upright_axis(affine)
     n = len(cosines)

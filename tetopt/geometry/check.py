@@ -1,4 +1,4 @@
-"""Is it a mesh? Questions whose answers a solver takes for granted."""
+"""Checks of the properties of a mesh that solvers take for granted."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ def check_mesh(
     is_manifold: bool = True,
     of_cell: ArrayLike | None = None,
 ) -> list[str]:
-    """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
+    """List the defects of a mesh, one line each, with the first offenders; empty if there are none.
 
-    In a mesh every node is used, and no two lie in the same place; every cell is positively oriented, has distinct
-    corners and is there once, and no mid-edge node folds it; every facet is in one or two cells, which lie on its two
-    sides (so the mesh conforms and does not fold); the boundary is closed, a manifold (`manifold_problems`), and one
-    piece. With labels, so are their interfaces manifolds. With an image no node lies beyond its box; if the mesh fills
-    that, the boundary's facets lie on the box's faces, and the cells' volumes add up to it.
+    In a sound mesh every node is used, and no two nodes coincide. Every cell is positively oriented, has distinct
+    corners, occurs once, and is not folded by a mid-edge node. Every facet belongs to one or two cells, which lie on
+    opposite sides of it, so that the mesh conforms and does not fold. The boundary is closed, a manifold
+    (`manifold_problems`) and connected. With labels, their interfaces are manifolds, too. With an image, no node lies
+    beyond its box; if the mesh fills the box, boundary facets lie on its faces and the cells' volumes add up to it.
 
     Parameters
     ----------
     mesh : Mesh
         Points in world mm.
     image : Image, optional
-        The image whose box the mesh should fill, or lie in. Only where it fills it, overlaps of cells that share no
-        facet are found.
+        The image whose box the mesh should fill, or lie in. Overlaps of cells that share no facet are found only if
+        the mesh should fill it.
     is_whole : bool
-        Whether it should be one piece; a mask may have several.
+        Require one connected component; a mask may have several.
     is_filled : bool
-        Whether it should fill the image's box; a mask's only lies within it.
+        Require that it fills the image's box; the mesh of a mask only lies within it.
     is_manifold : bool
-        Whether its boundary should be one; a mask's may be none.
+        Require that its boundary is a manifold; a mask's may not be.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell, 0 or more.
 
@@ -60,7 +60,7 @@ def check_mesh(
     Raises
     ------
     InputError
-        Mesh and image of different dimension, or labels that are not one whole number a cell.
+        Mesh and image of different dimension, or labels that are not one whole number per cell.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def check_mesh(
             f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {image.ndim}-D image"
         )
     problems = [*_problems_of_nodes(mesh), *_problems_of_cells(mesh)]
-    if not problems:  # what follows takes sound cells for granted
+    if not problems:  # the other checks assume sound cells
         problems = _problems_of_facets(mesh)
     if problems:
         return problems
@@ -91,7 +91,7 @@ def check_mesh(
 
 
 def _first(numbers: NDArray) -> str:
-    """How many there are, and the first of them, for a message."""
+    """The count and the first numbers, for a message."""
     return f"{len(numbers)}, the first {numbers[:5].tolist()}"
 
 
@@ -99,12 +99,12 @@ def _problems_of_nodes(mesh: Mesh) -> list[str]:
     problems = []
     unused = np.flatnonzero(np.bincount(mesh.cells.ravel(), minlength=len(mesh.points)) == 0)
     if len(unused):
-        problems.append(f"nodes that no cell uses: {_first(unused)}")
+        problems.append(f"unused nodes: {_first(unused)}")
     order = np.lexsort(mesh.points.T)
     same = (mesh.points[order[1:]] == mesh.points[order[:-1]]).all(axis=1)
     if same.any():
         pairs = np.column_stack([order[:-1], order[1:]])[same]
-        problems.append(f"pairs of nodes in one place: {_first(np.sort(pairs, axis=1))}")
+        problems.append(f"pairs of nodes at the same position: {_first(np.sort(pairs, axis=1))}")
     return problems
 
 
@@ -113,20 +113,20 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
     ordered = np.sort(mesh.cells, axis=1)
     repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(repeated):
-        problems.append(f"cells with a corner twice: {_first(repeated)}")
+        problems.append(f"cells with a repeated corner: {_first(repeated)}")
     flat = np.flatnonzero(~(volumes(mesh.points, mesh.cells) > 0.0))
     if len(flat):
-        problems.append(f"cells that are flat or inverted: {_first(flat)}")
+        problems.append(f"flat or inverted cells: {_first(flat)}")
     _, index, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
-        problems.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
+        problems.append(f"duplicate cells: {_first(np.sort(index[counts > 1]))}")
     return problems
 
 
 def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
-    """The least Jacobian determinant of each cell of order 2 over the straight cell's, (M,); 0 or less: it is folded.
+    """Least ratio of each quadratic cell's Jacobian determinant to the straight cell's, (M,); 0 or less if folded.
 
-    Taken at corners, mid-edge nodes and the points of both rules of integration of `tetopt.geometry.quadratic`.
+    Evaluated at corners, mid-edge nodes and the points of both integration rules of `tetopt.geometry.quadratic`.
     """
     n = mesh.ndim
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
@@ -147,9 +147,7 @@ def _problems_of_facets(mesh: Mesh) -> list[str]:
     shared = facets(mesh.cells)
     pairs = folded(mesh.cells, shared)
     if len(pairs):
-        problems.append(
-            f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}"
-        )
+        problems.append(f"facets with both cells on the same side, or with more than two cells; cells: {_first(pairs)}")
     outer = shared.nodes[shared.n_cells == 1]
     if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
         edges = np.sort(outer[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
@@ -168,26 +166,27 @@ def _problems_of_pieces(mesh: Mesh) -> list[str]:
 
 
 def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]:
-    """Where the boundary, or with labels of the cells the interface of two of them, is no manifold, a line each.
+    """List where the boundary, or with labels an interface between two labels, is not a manifold, one line each.
 
-    At an edge (in 2-D at a node) that is in more than two of its facets; at a node around which its facets fall into
-    several fans. Where three labels or more meet, or two at the boundary, interfaces end, and are not asked.
+    It is not a manifold at an edge (in 2-D a node) that belongs to more than two of its facets, and at a node around
+    which its facets form several fans. Where three or more labels meet, or two at the boundary, interfaces end, and
+    nothing is checked.
 
     Parameters
     ----------
     mesh : Mesh
-        Whose facets are in one or two cells, which do not fold over one another.
+        A conforming mesh without overlaps: each facet belongs to one or two cells.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell, 0 or more.
 
     Raises
     ------
     InputError
-        Labels that are not one whole number from 0 for each cell.
+        Labels that are not one whole number >= 0 per cell.
     """
     labels = np.zeros(len(mesh.cells), dtype=np.int64) if of_cell is None else np.asarray(of_cell)
     if labels.shape != (len(mesh.cells),) or not ((np.rint(labels) == labels) & (labels >= 0)).all():
-        raise InputError(f"of_cell: expected a whole number from 0 for each of the mesh's {len(mesh.cells)} cells")
+        raise InputError(f"of_cell: expected a whole number >= 0 for each of the mesh's {len(mesh.cells)} cells")
     at_ridges, at_nodes = pinches(facets(mesh.cells), labels.astype(np.int64))
     whose = "the boundary" if of_cell is None else "the interface of two labels"
     problems = []
@@ -203,7 +202,7 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
 
 
 def _most_frequent(pairs: NDArray[np.int64]) -> str:
-    """The most frequent pairs of labels, and how often they are there, for a message."""
+    """The most frequent pairs of labels, with their counts, for a message."""
     kinds, counts = np.unique(pairs, axis=0, return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
     words = [f"{kinds[k, 0]} and {kinds[k, 1]} at {counts[k]}" for k in most]
@@ -211,37 +210,37 @@ def _most_frequent(pairs: NDArray[np.int64]) -> str:
 
 
 def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh") -> None:
-    """InputError if cells overlap at a facet, or more than two share one; `shared` are its facets, if known.
+    """Raise InputError if cells overlap at a facet, or more than two share one; `shared` are its facets, if known.
 
     The message names the mesh by `source`.
 
     Raises
     ------
     InputError
-        With the first cells that do.
+        Cells overlap; the message names the first.
     """
     pairs = folded(mesh.cells, shared)
     if len(pairs):
         raise InputError(
-            f"{source}: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "
-            f"first are of cells {pairs[:3].tolist()}; mend the mesh"
+            f"{source}: at {len(pairs)} facets cells overlap (inverted cells do) or more than two cells meet; the "
+            f"first belong to cells {pairs[:3].tolist()}; repair the mesh"
         )
 
 
 def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Boundary facets, (B, n) nodes, and whether each lies on a face of the image's box, (B,)."""
+    """Boundary facets, (B, n) nodes, and True for those on a face of the image's box, (B,)."""
     outer = boundary_facets(mesh.cells)
     is_on = facets_on_sides(image.to_index(mesh.points), outer, box_sides(image.shape))
     return outer, np.any(is_on, axis=(1, 2))
 
 
 def filled_fraction(mesh: Mesh, image: Image) -> float:
-    """The volume of the cells over that of the image's box; 1 where they fill it without overlaps."""
+    """Ratio of the cells' volume to that of the image's box; 1 if they fill it without overlaps."""
     return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
 
 def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:
-    """How far each node lies beyond the image's box, voxels along an index axis, (N,); below 0 inside."""
+    """Distance of each node beyond the image's box, voxels along an index axis, (N,); negative inside."""
     low, high = box_sides(image.shape).T
     index = image.to_index(mesh.points)
     return np.asarray(np.maximum(low - index, index - high).max(axis=1))

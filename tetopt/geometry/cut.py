@@ -13,7 +13,7 @@ from tetopt.geometry.simplex import Cells, Points
 class Cut(NamedTuple):
     """Polygons of three or four corners; a triangle repeats its last corner."""
 
-    corners: NDArray[np.float64]  # (K, 4, w), of what `plane_cut` takes for points
+    corners: NDArray[np.float64]  # (K, 4, w), in the coordinates given to `plane_cut`
     cells: NDArray[np.int64]  # (K,) the cell each one comes from
 
 
@@ -30,12 +30,12 @@ for _a, _b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
 
 
 def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
-    """Where the plane height = 0 cuts the cells.
+    """Cut the cells by the plane height = 0.
 
     Parameters
     ----------
     points : (N, w) float64
-        Their coordinates, or whatever else is linear in each cell.
+        Node coordinates, or any other values that are linear in each cell.
     cells : (M, 4) integer
     height : (N,) float64
         Signed distance of each node from the plane, in any unit; a node on the plane counts as above.

@@ -1,8 +1,8 @@
-"""The surfaces between the labels of a mesh's cells, and where they are no manifolds.
+"""The surfaces between the labels of a mesh's cells, and the places where they are not manifold.
 
-A facet between two labels is in the surface of both, turned out of either; on the boundary the other is
-`OUTSIDE_LABEL`, which has a surface as labels do. A ridge is where facets of a surface meet: an edge of triangles, a
-node of segments. In a manifold without a rim two facets meet at each ridge, and those around a node are one fan.
+A facet between two labels belongs to the surface of both and faces out of either; on the boundary the other label is
+`OUTSIDE_LABEL`, which has a surface, too. Facets of a surface meet at ridges: edges of triangles, nodes of segments.
+In a manifold without a rim two facets meet at each ridge, and the facets around a node form one fan.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tetopt.geometry.topology import Facets, facets, linked, stars
 
 _Key = TypeVar("_Key", bound=Hashable)
 
-OUTSIDE_LABEL = -1  # what lies beyond the boundary, among labels, which are 0 and more
+OUTSIDE_LABEL = -1  # stands for the space beyond the boundary; labels are 0 and more
 
 
 class LabelSurfaces(NamedTuple):
@@ -32,12 +32,12 @@ class LabelSurfaces(NamedTuple):
 
 
 class Ridges(NamedTuple):
-    """Where the facets of each label's surface meet, those of each label apart."""
+    """Ridges at which facets of one label's surface meet, listed separately for each label."""
 
     label: NDArray[np.int64]  # (R,)
     nodes: NDArray[np.int64]  # (R, n-1), ascending
-    n_facets: NDArray[np.int64]  # (R,), of that label that meet there
-    n_labels: NDArray[np.int64]  # (R,), that meet there, `OUTSIDE_LABEL` among them
+    n_facets: NDArray[np.int64]  # (R,), facets of that label that meet there
+    n_labels: NDArray[np.int64]  # (R,), labels that meet there, including `OUTSIDE_LABEL`
     of_facet: NDArray[np.int64]  # (S, n), ridge opposite each of a facet's nodes
 
 
@@ -47,7 +47,7 @@ class Fans(NamedTuple):
     label: NDArray[np.int64]  # (P,)
     node: NDArray[np.int64]  # (P,)
     n_fans: NDArray[np.int64]  # (P,), connected sets of the label's facets around it, over the ridges that end there
-    n_labels: NDArray[np.int64]  # (P,), that meet there, `OUTSIDE_LABEL` among them
+    n_labels: NDArray[np.int64]  # (P,), labels that meet there, including `OUTSIDE_LABEL`
 
 
 def label_surfaces(shared: Facets, of_cell: NDArray[np.integer]) -> LabelSurfaces:
@@ -56,7 +56,7 @@ def label_surfaces(shared: Facets, of_cell: NDArray[np.integer]) -> LabelSurface
     Parameters
     ----------
     shared : Facets
-        Of a conforming mesh, see `tetopt.geometry.topology.facets`.
+        Facets of a conforming mesh, see `tetopt.geometry.topology.facets`.
     of_cell : (M,) integers
         Label of each cell, 0 or more.
     """
@@ -113,14 +113,14 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
 class Pinches(NamedTuple):
     """Ridges, or nodes, at which a surface between exactly two labels is not a manifold."""
 
-    labels: NDArray[np.int64]  # (K, 2), ascending, `OUTSIDE_LABEL` among them
+    labels: NDArray[np.int64]  # (K, 2), ascending, may include `OUTSIDE_LABEL`
     nodes: NDArray[np.int64]  # (K, n-1) of ridges, (K, 1) of nodes
 
 
 def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinches]:
     """Ridges in more than two facets of a surface, and nodes around which its facets form several fans.
 
-    Where three labels or more meet, surfaces end: those places are left out. Arguments as of `label_surfaces`.
+    Surfaces end where three or more labels meet, so those places are skipped. Arguments as for `label_surfaces`.
     """
     surfaces = label_surfaces(shared, of_cell)
     ridges = surface_ridges(surfaces)
@@ -138,10 +138,10 @@ def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinc
 
 
 def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Cells that stay, (M,), so that the boundary of a conforming mesh is a manifold; few others are left out.
+    """Select the cells to keep, (M,), so that the boundary of a conforming mesh is a manifold; few are dropped.
 
-    Of several fans of cells around an edge or a node of the boundary the largest stays; where the cells around a node
-    are one fan, and the outside is not, the cells between two parts of the outside go.
+    Where several fans of cells surround an edge or a node of the boundary, the largest stays. Where the cells around a
+    node form one fan but the outside does not, the cells between two parts of the outside are dropped.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class Corners(NamedTuple):
 
 
 def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDArray[np.float64]) -> Iterable[int]:
-    """Cells of the star of an edge or a node that go for the boundary to be a manifold there; none if it is."""
+    """Cells of an edge's or a node's star to drop so that the boundary is a manifold there; none if it is."""
     links = {
         cell: [other for node, other in zip(*corners, strict=True) if node not in place and other in star]
         for cell, corners in star.items()
@@ -192,7 +192,7 @@ def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDAr
         return [cell for fan in fans if fan is not largest for cell in fan]
     if len(place) > 1 or not star or len(next(iter(star.values())).nodes) == 3:
         return []  # around an edge, or a node of triangles, a fan has two ends or none
-    # Facets of the boundary, by what they are opposite to; two are linked by an edge that ends in the node.
+    # Facets of the boundary, by the node opposite; an edge that ends in the node links two.
     outer = [
         (cell, node)
         for cell, (nodes, across) in star.items()
@@ -207,7 +207,7 @@ def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDAr
 
 
 def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
-    """Connected sets of a graph, each from its first member on."""
+    """Connected sets of a graph, each starting with its first member."""
     sets: list[list[_Key]] = []
     seen: set[_Key] = set()
     for first in links:
@@ -222,7 +222,7 @@ def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
 
 
 def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[int]:
-    """The shortest way in a connected graph from one set of cells to another, both ends among it."""
+    """The shortest path in a connected graph from one set of cells to another, including both ends."""
     before: dict[int, int | None] = dict.fromkeys(sorted(begin))
     for cell in (queue := list(before)):
         if cell in end:
@@ -237,6 +237,6 @@ def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[in
 
 
 def _times(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How often each value occurs in all, at each."""
+    """The number of occurrences of each value, at each position."""
     _, which, count = np.unique(values, return_inverse=True, return_counts=True)
     return count[which]

@@ -1,4 +1,4 @@
-"""Distances of many points from triangles, exact, by bins of the box that these fill."""
+"""Exact distances of many points from triangles, by bins of the triangles' bounding box."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from tetopt.geometry.vectors import cross, dot, minus, over, row, scaled
 from tetopt.system.kernels import Floats1, Floats2, Ints1, Ints2, entry, helper, run, unit
 
-BINS_POWER = 0.37  # of the number of triangles: bins along the box's longest side, a triangle or a few in each
-FLAT_NORMAL = 2e-6  # of a triangle's longest edge, squared: with a shorter normal its edges are all of it
-POINTS_PER_TASK = 64  # that a parallel task takes at once
+BINS_POWER = 0.37  # exponent of the number of triangles for bins along the longest side, with a few triangles in each
+FLAT_NORMAL = 2e-6  # of a triangle's longest edge, squared: with a shorter normal it counts as its edges
+POINTS_PER_TASK = 64  # points that a parallel task handles at once
 
 
 class _Search(NamedTuple):
-    """The squared distances to be filled in, and what of."""
+    """The squared distances to fill in, and their inputs."""
 
     squares: Floats1
     points: Floats2
@@ -31,10 +31,10 @@ class _Search(NamedTuple):
 def triangle_distances(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance of points (K, 3) from the nearest of triangles (T, 3, 3), one or more, (K,) float64 in their unit.
 
-    Of flat triangles the edges count, or the one point that they are.
+    Flat triangles count as their edges, or as a single point.
     """
     a, b, c = corners.swapaxes(0, 1)
-    boxes = [extreme(extreme(a, b), c) for extreme in (np.minimum, np.maximum)]  # by axis they take ten times as long
+    boxes = [extreme(extreme(a, b), c) for extreme in (np.minimum, np.maximum)]  # ten times as fast as by axis
     low = boxes[0].min(axis=0)
     extent = boxes[1].max(axis=0) - low
     size = float(extent.max()) / len(corners) ** BINS_POWER or 1.0
@@ -44,7 +44,7 @@ def triangle_distances(points: NDArray[np.float64], corners: NDArray[np.float64]
     _list_by_bin(start[2:], np.empty(0, dtype=np.int64), *ends, counts)
     np.cumsum(start, out=start)
     listed = np.empty(start[-1], dtype=np.int64)
-    _list_by_bin(start[1:], listed, *ends, counts)  # after which each bin's place is where the next one begins
+    _list_by_bin(start[1:], listed, *ends, counts)  # moves each bin's start to that of the next one
     squares = np.full(len(points), np.inf)
     rows = np.ascontiguousarray(corners.reshape(-1, 3))
     work = _Search(squares, np.ascontiguousarray(points), rows, start[:-1], listed, counts, low, size)
@@ -57,7 +57,7 @@ def triangle_distances(points: NDArray[np.float64], corners: NDArray[np.float64]
 
 @entry
 def _list_by_bin(place: Ints1, listed: Ints1, low: Ints2, high: Ints2, counts: Ints1) -> None:
-    """Count the triangles whose boxes, in bins, reach each bin; or list them, from the places on where each begins."""
+    """Count the triangles whose bounding boxes reach each bin, or list them, starting at the place of each bin."""
     for triangle in range(len(low)):
         for i in range(low[triangle, 0], high[triangle, 0] + 1):
             for j in range(low[triangle, 1], high[triangle, 1] + 1):
@@ -91,7 +91,7 @@ def _triangle_square(p: tuple, a: tuple, b: tuple, c: tuple) -> float:
 
 @helper
 def _bin_square(work: _Search, p: tuple, at: int, least: float) -> float:
-    """The least squared distance of p so far and from the triangles of a bin."""
+    """Squared distance of p from the triangles of a bin, or the least so far if that is smaller."""
     for place in range(work.start[at], work.start[at + 1]):
         corner = 3 * work.listed[place]
         a, b, c = row(work.corners, corner), row(work.corners, corner + 1), row(work.corners, corner + 2)
@@ -107,7 +107,7 @@ def _gap(x: float, place: int) -> float:
 
 @helper
 def _nearest_square(work: _Search, p: tuple) -> float:
-    """Squared distance of p: ring after ring of bins around the one nearest to it, until none can be nearer."""
+    """Squared distance of p: search rings of bins around the nearest one until none can be nearer."""
     least, counts, size = np.inf, work.counts, work.size
     x = over(minus(p, (work.low[0], work.low[1], work.low[2])), size)
     at_i = int(min(max(x[0], 0.0), counts[0] - 1.0))

@@ -1,7 +1,7 @@
-"""Cells of order 1 and 2: nodes, shape functions, rules of integration.
+"""Cells of order 1 and 2: nodes, shape functions, integration rules.
 
-Order 1 has a node at each corner and displacements that are linear in a cell; order 2 also one in the middle of each
-edge, and quadratic displacements. Edges are straight, so that a cell of either order is the same simplex, unless their
+Order 1 has a node at each corner and linear displacements in a cell; order 2 adds a node in the middle of each edge
+and has quadratic displacements. Edges are straight, so that a cell is the same simplex in either order, unless their
 midpoints are given: such cells are isoparametric, and the shape functions map the straight cell onto the curved one.
 Places within a cell are barycentric, (K, n+1). See Zienkiewicz and Taylor, The Finite Element Method, volume 1,
 chapters 4 (shape functions) and 5 (integration).
@@ -21,9 +21,9 @@ from tetopt.geometry.simplex import determinants, outward_facet_nodes, volume_gr
 # Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and FEBio; the first
 # three are a triangle's, nodes 3 to 5.
 QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
-CURVED_POINTS = {7: 2, 14: 3}  # of `curved_rule`: dimension by number
+CURVED_POINTS = {7: 2, 14: 3}  # number of points of `curved_rule`: its dimension
 ROOT_OF_15 = 15.0**0.5  # in the coordinates and weights of Radon's rule and Gauss's
-# Of `curved_rule` by dimension: points, each for all distinct permutations of its coordinates, and their weights.
+# Points of `curved_rule` by dimension, each for all distinct permutations of its coordinates, with their weights.
 CURVED_ORBITS: dict[int, list[tuple[tuple[float, ...], float]]] = {
     1: [((0.5, 0.5), 4.0 / 9.0), ((0.5 + 0.1 * ROOT_OF_15, 0.5 - 0.1 * ROOT_OF_15), 5.0 / 18.0)],
     2: [
@@ -50,7 +50,7 @@ def edge_ends(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The edges (E, 2) of cells (M, n+1), sorted by their ends; and of each cell the numbers (M, 3 or 6) of its own."""
+    """The edges (E, 2) of cells (M, n+1), sorted by their ends, and the numbers (M, 3 or 6) of each cell's edges."""
     ends = edge_ends(cells)
     n_nodes = int(cells.max()) + 1
     # As single numbers: ten times faster than as pairs, at 112,000 tetrahedra.
@@ -61,10 +61,10 @@ def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
 def quadratic(
     points: NDArray[np.float64], cells: NDArray[np.int64], midpoints: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Nodes (N + E, n) and cells (M, 6 or 10) of order 2, of points (N, n) and cells (M, n+1).
+    """Nodes (N + E, n) and cells (M, 6 or 10) of order 2 from points (N, n) and cells (M, n+1).
 
-    The points come first, then the midpoints (E, n) of the edges, which are sorted by their ends, by default those of
-    straight ones; a cell's corners come first, then the midpoints of `cell_edges`.
+    The points come first, then the midpoints (E, n) of the edges sorted by their ends (by default the edges are
+    straight). A cell's corners come first, then the midpoints of `cell_edges`.
     """
     edges, number = numbered_edges(cells)
     if midpoints is None:
@@ -75,22 +75,22 @@ def quadratic(
 def of_order(
     points: NDArray[np.float64], cells: NDArray[np.int64], order: int, midpoints: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Nodes and cells of order 1, which are the points and cells themselves, or 2; InputError for another order."""
+    """Nodes and cells of order 1 (the points and cells themselves) or 2; raise InputError for another order."""
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
     return (points, cells) if order == 1 else quadratic(points, cells, midpoints)
 
 
 def node_count(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
-    """How many nodes of an order there are, those in the middle of edges with order 2."""
+    """Number of nodes of an order; order 2 includes the mid-edge nodes."""
     return len(of_order(points, cells, order)[0])
 
 
 def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nodes (K, 3 or 6) of facets (K, 2), rows of (cell, local corner opposite), of cells of order 2.
 
-    The corners come first, facing out, then the midpoints: of a triangle those of the first two corners, of the second
-    and third, and of the third and first.
+    The corners come first, facing out, then the midpoints: for a triangle between its first and second, second and
+    third, and third and first corners.
     """
     n = 2 if cells.shape[1] == 6 else 3
     of_edge = {frozenset(edge): n + 1 + number for number, edge in enumerate(cell_edges(n).tolist())}
@@ -118,7 +118,7 @@ def shape_values(places: NDArray[np.float64], order: int) -> NDArray[np.float64]
 def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]:
     """Derivatives of the shape functions by the barycentric coordinates, (K, A, n+1).
 
-    Multiplied by the gradients of the coordinates, (n+1, n), they are those of the shape functions in the world.
+    Multiplied by the gradients of the coordinates, (n+1, n), they give the shape functions' gradients in the world.
     """
     n_places, n_corners = places.shape
     if order == 1:
@@ -136,8 +136,8 @@ def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]
 def gauss_rule(n: int, order: int, is_curved: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (Q, n+1) and weights (Q,), which sum to 1, of the rule that integrates a cell's stiffness.
 
-    One point for order 1; n + 1 for order 2, exact for polynomials of degree 2, which the product of two strains is.
-    Point k lies nearest to corner k. Curved cells of order 2 take `curved_rule`.
+    One point for order 1; n + 1 for order 2, exact for polynomials of degree 2 such as the product of two strains.
+    Point k lies nearest to corner k. Curved cells of order 2 use `curved_rule`.
     """
     if is_curved and order == 2:
         return curved_rule(n)
@@ -152,8 +152,8 @@ def gauss_rule(n: int, order: int, is_curved: bool = False) -> tuple[NDArray[np.
 def curved_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (Q, n+1) and weights (Q,), which sum to 1, of a rule of degree 5 with 3, 7 or 14 points.
 
-    It integrates exactly what mid-edge nodes add: a curved tetrahedron's volume is an integral of degree 3, its weight
-    on a node of degree 5, the pull of a uniform stress on a node of degree 3, so that patch tests hold. The rules are
+    It integrates curved cells exactly: a tetrahedron's volume is an integral of degree 3, its weight on a node of
+    degree 5, the force of a uniform stress on a node of degree 3, so that patch tests hold. The rules are
     Gauss's, Radon's (Monatshefte fuer Mathematik 52, 1948, 286-300) and Walkington's (Carnegie Mellon University,
     research report 00-CNA-023, 2000).
     """
@@ -166,9 +166,9 @@ def curved_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def on_curved_rule(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (M, n+1) of the parts of cells nearest to each corner at the points of `curved_rule`, (M, Q).
+    """Transfer values (M, n+1) of the parts of cells nearest to each corner to the points of `curved_rule`, (M, Q).
 
-    A point as near to several corners as to one has the mean of theirs.
+    A point equally near to several corners gets the mean of their values.
     """
     places = curved_rule(values.shape[1] - 1)[0]
     is_nearest = places == places.max(axis=1, keepdims=True)
@@ -178,10 +178,10 @@ def on_curved_rule(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def jacobian_ratios(
     nodes: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Jacobian determinants of quadratic cells (M, 6 or 10) at places (K, n+1), over the straight cells', (M, K).
+    """Jacobian determinants of quadratic cells (M, 6 or 10) at places (K, n+1), relative to straight cells, (M, K).
 
-    The volume of what is around a place over that in the cell with the same corners and straight edges: 1 everywhere
-    in a straight cell; where it is 0 or less, the cell is folded and no solver takes it.
+    The ratio of the local volume to that in the cell with the same corners and straight edges: 1 everywhere in a
+    straight cell; where it is 0 or less, the cell is folded and no solver accepts it.
     """
     corners = cells[:, : places.shape[1]]
     gradients = volume_gradients(nodes, corners) / volumes(nodes, corners)[:, None, None]
@@ -190,7 +190,7 @@ def jacobian_ratios(
 
 
 def mapped_slopes(nodes: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (M, n, n) of the map from straight to curved cells, of nodes and gradients (M, A, n) there."""
+    """Derivatives (M, n, n) of the map from straight to curved cells, from nodes and gradients (M, A, n)."""
     return np.einsum("cai,caj->cij", nodes, gradients)
 
 
@@ -202,7 +202,7 @@ def jacobian_bounds(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDA
     """
     n = nodes.shape[1]
     corners, edges = nodes[cells[:, : n + 1]], cell_edges(n)
-    controls = np.empty((len(cells), n + 1, n + 1, n))  # of the cell as a Bezier one, by pairs of corners
+    controls = np.empty((len(cells), n + 1, n + 1, n))  # control points of the cell in Bezier form, by pairs of corners
     controls[:, range(n + 1), range(n + 1)] = corners
     middles = 2.0 * nodes[cells[:, n + 1 :]] - 0.5 * (corners[:, edges[:, 0]] + corners[:, edges[:, 1]])
     controls[:, edges[:, 0], edges[:, 1]] = controls[:, edges[:, 1], edges[:, 0]] = middles

@@ -1,4 +1,4 @@
-"""Closed forms for triangles and tetrahedra, one row a cell.
+"""Closed forms for triangles and tetrahedra, one row per cell.
 
 Everywhere `points` is (N, n) float64 in mm and `cells` is (M, n+1) integer, n = 2 or 3.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
 Cells = NDArray[np.integer]
-CELLS_AT_A_TIME = 2**13  # whose corners a processor's cache holds
+CELLS_AT_A_TIME = 2**13  # their corners fit into a processor's cache
 
 
 def edge_pairs(n: int) -> list[tuple[int, int]]:
@@ -27,7 +27,7 @@ def facet_nodes(n: int) -> list[tuple[int, ...]]:
 
 
 def outward_facet_nodes(n: int) -> NDArray[np.int64]:
-    """Local nodes of each facet, facing out: facets of a positively oriented simplex do for even k as they stand."""
+    """Local nodes of each facet, facing out; for even k, `facet_nodes` of a positively oriented simplex do already."""
     return np.array(
         [nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:]) for k, nodes in enumerate(facet_nodes(n))]
     )
@@ -38,7 +38,7 @@ def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     result, columns = np.empty(len(cells)), np.ascontiguousarray(points.T)
     for start in range(0, len(cells), CELLS_AT_A_TIME):
         some = slice(start, start + CELLS_AT_A_TIME)
-        corners = columns[:, np.ascontiguousarray(cells[some].T)]  # one coordinate after the other: half of the time
+        corners = columns[:, np.ascontiguousarray(cells[some].T)]  # coordinate by coordinate takes half the time
         result[some] = determinants((corners[:, 1:] - corners[:, :1]).T) / factorial(points.shape[1])
     return result
 
@@ -77,11 +77,11 @@ def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def regular_edge(size: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Edge, mm, of the regular simplex in n dimensions that has a volume, mm^n."""
+    """Edge, mm, of the regular n-simplex of a given volume, mm^n."""
     return (6.0 * 2.0**0.5 * size) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * size) ** 0.5
 
 
-Vectors = list[NDArray[np.float64]]  # (n,) of them, their components, (M,) each: three times as fast as rows
+Vectors = list[NDArray[np.float64]]  # n components, (M,) each: three times as fast as rows
 
 
 def _corners(points: Points, cells: Cells) -> list[Vectors]:
@@ -95,7 +95,7 @@ def _minus(a: Vectors, b: Vectors) -> Vectors:
 
 
 def _dot(a: Vectors, b: Vectors) -> NDArray[np.float64]:
-    total = a[0] * b[0] + 0.0  # + 0.0: no -0, on which side of it angles of flat cells turn
+    total = a[0] * b[0] + 0.0  # + 0.0 avoids -0, whose sign would change angles of flat cells
     for x, y in zip(a[1:], b[1:], strict=True):
         total += x * y
     return total
@@ -106,13 +106,13 @@ def _cross(a: Vectors, b: Vectors) -> Vectors:
 
 
 def _facet_normals(points: Points, cells: Cells) -> list[Vectors]:
-    """Outward normals as long as their facet's area, by the node opposite; the cells positively oriented."""
+    """Outward normals of positively oriented cells, as long as their facet's area, by the node opposite."""
     corners = _corners(points, cells)
     if points.shape[1] == 2:
         along = [_minus(corners[b], corners[a]) for a, b in ((1, 2), (2, 0), (0, 1))]
         return [[y, -x] for x, y in along]
     normals = []
-    for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)):  # in the order that turns the product outwards
+    for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)):  # ordered so that the product points outwards
         product = _cross(_minus(corners[b], corners[a]), _minus(corners[c], corners[a]))
         normals.append([0.5 * x for x in product])
     return normals
@@ -133,8 +133,8 @@ def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
 
     The shape measure of Section 2.1. The inradius is n v / (sum of facet areas). In 2-D the circumradius is
     abc / 4v; in 3-D it is |a^2 (b x c) + b^2 (c x a) + c^2 (a x b)| / 12 v with the edges a, b, c from one node.
-    The quotient of both has v^2 above the line, so a flat cell needs no special case. Inverted cells get the
-    value of their mirror image.
+    Their quotient has v^2 in the numerator, so flat cells need no special case. Inverted cells get the value of
+    their mirror image.
     """
     v = volumes(points, cells)
     if points.shape[1] == 2:

@@ -1,8 +1,8 @@
 """The boundary of a set of tetrahedra as a watertight triangle surface.
 
 Cells of the set that touch only in an edge or a node leave an edge with four triangles, or a node with several fans of
-triangles. They are parted here: each sheet of the surface gets its own copy, and copies are moved apart a little,
-since readers of surface files weld nodes by their place.
+triangles. This module parts them: each sheet of the surface gets its own copy, and copies are moved apart slightly,
+since readers of surface files weld nodes by their position.
 
 Half-edge 3 t + k runs from corner k of triangle t to the next one; it and the corner it leaves share that number.
 """
@@ -21,19 +21,19 @@ from tetopt.geometry.topology import Facets, facets, linked
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
-# Copies are moved by this part of the smallest height of the cells around,
+# Copies are moved by this fraction of the smallest height of the surrounding cells,
 SHIFT_FRACTION = 2e-3
 # or by so many float32 spacings, as binary STL is in float32,
 SHIFT_SPACINGS = 16
-# but never by more than this part of that height, so that no cell turns inside out.
+# but never by more than this fraction of that height, so that no cell turns inside out.
 LARGEST_SHIFT_FRACTION = 0.1
 
-# Steps of the search for a way that is inwards of a whole fan: with the mean of the normals instead, sheets of random
-# sets of cells cross fifteen times as often, with three steps about as seldom.
+# Steps of the search for a direction inwards of a whole fan: with the mean of the normals instead, sheets of random
+# sets of cells cross fifteen times as often; with three steps, about as rarely.
 SEARCH_STEPS = 20
 
 FOLDED_MESSAGE = (
-    "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt quality --check`"
+    "surface: expected a conforming mesh, but some of the chosen cells overlap; see `tetopt quality --check`"
 )
 
 
@@ -45,11 +45,11 @@ class Surface(NamedTuple):
     points : (N, 3) float64
         World mm.
     triangles : (K, 3) int64
-        Normals out of the solid.
+        Normals point out of the solid.
     n_parted : int
         Nodes that have several copies, and edges that have several middles.
     largest_shift : float
-        The farthest that a copy was moved, mm; 0 where nothing was parted.
+        The largest displacement of a copy, mm; 0 if nothing was parted.
 
     Examples
     --------
@@ -67,7 +67,7 @@ class Surface(NamedTuple):
 
 
 class _Skin(NamedTuple):
-    """The boundary as it is in the mesh, and which half-edges belong together."""
+    """The boundary as it is in the mesh, with the pairs of half-edges."""
 
     points: NDArray[np.float64]  # (N, 3), all nodes of the mesh
     triangles: NDArray[np.int64]  # (K, 3)
@@ -78,23 +78,23 @@ class _Skin(NamedTuple):
 
 
 class _Sheets(NamedTuple):
-    """Fans or edges of which several lie in the same place and have to be moved apart."""
+    """Coincident fans or edges that must be moved apart."""
 
     points: NDArray[np.float64]  # (S, 3), equal where `place` is
     place: NDArray[np.int64]  # (S,)
     inside: NDArray[np.float64]  # (S,), the fraction of all directions that go into the solid, 0 to 1
     height: NDArray[np.float64]  # (S,), mm, of the cells around
     normals: NDArray[np.float64]  # (C, 3), unit vectors, of the triangles of all sheets
-    sheet: NDArray[np.int64]  # (C,), whose normal it is, ascending
+    sheet: NDArray[np.int64]  # (C,), the sheet of each normal, ascending
 
 
 def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
     """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each node.
 
-    Where chosen cells touch only in a node or an edge, the sheets of the surface are parted: the flattest keeps its
-    place, the others move into the narrower of their two sides, the narrowest farthest, by a five-hundredth of the
-    smallest height of the cells around, or what float32 needs. So the solid comes apart there, and a ring closed by an
-    edge alone opens. A cavity's wall is a surface of its own, with normals into the cavity.
+    Where chosen cells touch only in a node or an edge, the sheets of the surface are parted. The flattest keeps its
+    place; the others move into the narrower of their two sides, the narrowest farthest, by 1/500 of the smallest
+    height of the surrounding cells, or as far as float32 requires. So the solid separates there, and a ring closed
+    only by an edge opens. A cavity's wall is a separate surface, with normals into the cavity.
 
     Parameters
     ----------
@@ -108,17 +108,17 @@ def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], cho
     Returns
     -------
     Surface
-        Its points are numbered anew.
+        The surface; its points are renumbered.
 
     Raises
     ------
     InputError
-        Triangles in the plane, no cell chosen, a mask of another length, indices out of range or no integers, cells
-        that fold over one another.
+        Triangles in the plane, no cell chosen, a mask of the wrong length, indices that are out of range or not
+        integers, or overlapping cells.
 
     See Also
     --------
-    save_surface : Writes one.
+    save_surface : Write it to a file.
 
     Examples
     --------
@@ -154,7 +154,7 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
             raise InputError(f"surface: expected a mask of {len(cells)} cells, got shape {chosen.shape}")
         chosen = np.flatnonzero(chosen)
     if chosen.size == 0:
-        raise InputError("surface: no cell is chosen, expected at least one; choose another threshold or label")
+        raise InputError("surface: expected at least one cell, got none; choose another threshold or label")
     if not np.issubdtype(chosen.dtype, np.integer):
         raise InputError(f"surface: expected cells as a mask or as indices, got {chosen.dtype}")
     if chosen.min() < 0 or chosen.max() >= len(cells):
@@ -181,7 +181,7 @@ def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
 def _partners(
     cells: NDArray[np.int64], shared: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The half-edge that each one meets, (3K,); `facet` is each triangle's number among the facets."""
+    """The half-edge paired with each one, (3K,); `facet` is each triangle's number among the facets."""
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     n_nodes = int(cells.max()) + 1
     key, edge, count = np.unique(_pair_key(start, end, n_nodes), return_inverse=True, return_counts=True)
@@ -207,14 +207,14 @@ def _walks(
     facet: NDArray[np.int64],
     edge: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Number of the walk around an edge, from cell to cell through their facets, that ends in each facet asked for.
+    """Number of the walk around an edge, from cell to cell through facets, that ends in each requested facet.
 
     `crowded` are the edges' keys, ascending, and `edge` are indices into it. Every walk has two ends.
     """
     is_end = np.zeros(n_nodes, dtype=bool)
     is_end[crowded // n_nodes] = is_end[crowded % n_nodes] = True
     steps = []
-    # A cell leads from one facet at its edge to the other: they lie opposite the two nodes that the edge leaves out.
+    # A cell leads from one facet at its edge to the other: they lie opposite its two nodes that are not on the edge.
     for (i, j), (k, m) in zip(edge_pairs(3), reversed(edge_pairs(3)), strict=True):
         near = np.flatnonzero(is_end[cells[:, i]] & is_end[cells[:, j]])
         key = _pair_key(cells[near, i], cells[near, j], n_nodes)
@@ -245,14 +245,14 @@ def _smallest_heights(points: NDArray[np.float64], cells: NDArray[np.int64]) -> 
 
 
 def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The fan of each corner, (3K,), numbered from 0: the corners that one meets turning about a node."""
+    """The fan of each corner, (3K,), numbered from 0: the corners met while turning around a node."""
     corner = np.arange(len(partner))
     before = corner - corner % 3 + (corner + 2) % 3
     return linked(corner, partner[before], len(corner))[1]
 
 
 def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
-    """The fans at nodes that have several, (S,), ascending, and these fans as sheets."""
+    """The fans at nodes with several fans, (S,), ascending, and these fans as sheets."""
     node = np.empty(fan.max() + 1, dtype=np.int64)
     node[fan] = skin.triangles.ravel()
     is_split = np.bincount(node)[node] > 1
@@ -269,10 +269,10 @@ def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
 
 
 def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
-    """Half-edges, one of each pair, whose two ends are joined by another pair as well, (S,), and these as sheets.
+    """Half-edges, one per pair, whose two ends another pair joins as well, (S,), and these as sheets.
 
-    Where a ring of cells closes in an edge, but cells around each end of the edge close it too, neither end has
-    several fans, and still four triangles share the edge. A middle of its own for either pair parts them.
+    Where a ring of cells closes in an edge, and cells around each end of the edge close it, too, neither end has
+    several fans, but four triangles share the edge. A separate middle for each pair parts them.
     """
     half = np.flatnonzero(np.arange(len(fan)) < skin.partner)
     key = _pair_key(fan[half], fan[skin.partner[half]], fan.max() + 1)
@@ -292,10 +292,10 @@ def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
 
 
 def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """New places of the sheets, (S, 3), and by how much they moved, (S,), mm.
+    """New positions of the sheets, (S, 3), and their displacements, (S,), mm.
 
-    Of two sheets that do not cross, the narrower sides lie apart or one within the other. So each may move into its
-    own, if those within others move farther; and the widest need not move at all.
+    The narrower sides of two sheets that do not cross are disjoint or nested. So each sheet may move into its own
+    side if nested ones move farther, and the widest need not move at all.
     """
     if len(sheets.place) == 0:
         return sheets.points, np.zeros(0)
@@ -314,9 +314,9 @@ def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray[np.float64]:
-    """For each sheet a unit vector whose smallest product with its normals is the greatest, (S, 3).
+    """For each sheet, the unit vector that maximises the smallest dot product with its normals, (S, 3).
 
-    That is the direction of the point of their convex hull next to the origin; Frank and Wolfe's steps go there.
+    It points to the point of their convex hull nearest to the origin, which Frank-Wolfe steps approach.
     """
     start = np.flatnonzero(np.diff(sheet, prepend=-1))
     nearest = np.add.reduceat(normals, start) / np.diff(start, append=len(sheet))[:, None]
@@ -330,7 +330,7 @@ def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray
         way = np.divide(-(nearest * towards).sum(axis=1), square, out=np.zeros_like(square), where=square > 0.0)
         nearest += np.clip(way, 0.0, 1.0)[:, None] * towards
     length = np.linalg.norm(nearest, axis=1, keepdims=True)
-    # No direction is outwards of all where the origin is in the hull; any will do then.
+    # If the hull contains the origin, no direction is outwards of all normals, and any will do.
     nearest = np.where(length > 1e-9, nearest, normals[start])
     return nearest / np.linalg.norm(nearest, axis=1, keepdims=True)
 
@@ -342,9 +342,9 @@ def _with_middles(
     partner: NDArray[np.int64],
     middles: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points and triangles with these middles of half-edges and their partners put in.
+    """Insert middles of half-edges and their partners into points and triangles.
 
-    Their triangles are cut from the centroid to every corner and middle, which is the same for one, two or three.
+    Their triangles are split from the centroid to every corner and middle, whether they have one, two or three.
     """
     of_half = np.full(triangles.size, -1, dtype=np.int64)
     of_half[half] = of_half[partner] = len(points) + np.arange(len(middles))

@@ -1,4 +1,4 @@
-"""Who touches whom: facets, stars, colours and connected sets, from cells alone."""
+"""Adjacency of cells and nodes: facets, stars, colours and connected sets, from cells alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tetopt.geometry.simplex import facet_nodes
 from tetopt.system.kernel_cache import njit
 
 MOST_BY_INSERTION = 100  # facets with the same lowest node; more are sorted
-LARGEST_RATIO = 4  # of a node's number to how many there are, beyond which they are numbered anew
+LARGEST_RATIO = 4  # largest node number over the number of nodes, beyond which nodes are renumbered
 
 
 class Stars(NamedTuple):
@@ -30,7 +30,7 @@ class Facets(NamedTuple):
 
     nodes: NDArray[np.int64]  # (F, n), each row ascending; rows in lexicographic order
     cells: NDArray[np.int64]  # (F, 2), the second is -1 on the boundary
-    n_cells: NDArray[np.int64]  # (F,), cells that share it: 1 or 2 in a conforming mesh
+    n_cells: NDArray[np.int64]  # (F,), number of cells that share it: 1 or 2 in a conforming mesh
     of_cell: NDArray[np.int64]  # (M, n+1), the facet opposite each local node
     sign: NDArray[np.int64]  # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
 
@@ -43,7 +43,7 @@ def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
 
 @njit(cache=True, nogil=True)
 def _by_number(numbers: NDArray, n: int) -> tuple[NDArray, NDArray]:
-    """The order (K,) of numbers below `n`, equal ones as they come, and where each begins in it, (n+1,)."""
+    """Stable order (K,) of numbers below `n`, and the start of each number in it, (n+1,)."""
     start = np.zeros(n + 2, dtype=np.int64)
     for number in numbers:
         start[number + 2] += 1
@@ -57,7 +57,7 @@ def _by_number(numbers: NDArray, n: int) -> tuple[NDArray, NDArray]:
 
 
 def compact(cells: NDArray[np.int64], n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The nodes, of `n_nodes`, that cells use, ascending, and the cells by the places of their nodes among these."""
+    """The nodes, out of `n_nodes`, that cells use, ascending, and the cells with nodes numbered among these."""
     is_used = np.zeros(n_nodes, dtype=bool)
     is_used[cells] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[cells]
@@ -88,7 +88,7 @@ def _facet_rows(cells: NDArray, local: NDArray) -> tuple[NDArray, NDArray]:
             row, turns = rows[cell * (n + 1) + k], 1 - 2 * (k % 2)
             for d in range(n):
                 m, node = d, cells[cell, local[k, d]]
-                while m > 0 and row[m - 1] > node:  # each exchange turns the facet around
+                while m > 0 and row[m - 1] > node:  # each exchange reverses the facet
                     row[m] = row[m - 1]
                     m, turns = m - 1, -turns
                 row[m] = node
@@ -97,7 +97,7 @@ def _facet_rows(cells: NDArray, local: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def lexicographic_order(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Stable order of rows (K, n) of numbers from 0, and whether each row in it is the first of its kind."""
+    """Stable order of rows (K, n) of numbers from 0, and True for the first of equal rows in it."""
     if rows.max(initial=0) > LARGEST_RATIO * rows.size:
         rows = np.unique(rows, return_inverse=True)[1].reshape(rows.shape)
     order, start = _by_number(rows[:, 0], int(rows[:, 0].max(initial=-1)) + 1)
@@ -106,9 +106,10 @@ def lexicographic_order(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDA
 
 @njit(cache=True, nogil=True)
 def _sorted_within(order: NDArray, start: NDArray, rows: NDArray) -> NDArray:
-    """Sort rows that begin with the same number by the others, in place; the first of each kind, (K,).
+    """Sort rows that begin with the same number by the others, in place; return the first of each kind, (K,).
 
-    A dozen each, by insertion: with the order of the first numbers by counting a fifth of the time of sorting all.
+    Insertion sort of about a dozen rows each; with the counting sort of the first numbers it takes a fifth of the time
+    of sorting all.
     """
     is_first, base = np.ones(len(order), dtype=np.bool_), rows.max() + 1 if len(rows) > 0 else 1
     key = np.zeros(max(np.diff(start).max(), 1) if len(start) > 1 else 1, dtype=np.int64)
@@ -134,7 +135,7 @@ def _sorted_within(order: NDArray, start: NDArray, rows: NDArray) -> NDArray:
 
 @njit(cache=True, nogil=True)
 def _listed_facets(order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """The first three fields of `Facets` but the number of cells, from the order of the facets of all cells."""
+    """Nodes, cells and facets by cell, as in `Facets`, from the order of the facets of all cells."""
     n_facets, n = is_first.sum(), rows.shape[1]
     nodes, of_cell = np.empty((n_facets, n), dtype=np.int64), np.empty(sign.shape, dtype=np.int64)
     sides, facet, n_here = np.full((n_facets, 2), -1, dtype=np.int64), -1, 0
@@ -154,8 +155,8 @@ def _listed_facets(order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArr
 def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by facet.
 
-    Of positively oriented cells: where the mesh folds over itself, or three cells and more share a facet. Empty for a
-    conforming mesh. `shared` are the cells' facets where they are known already.
+    Positively oriented cells do so where the mesh folds over itself, or where three or more share a facet. Empty for a
+    conforming mesh. `shared` are the cells' facets, if already known.
     """
     shared = facets(cells) if shared is None else shared
     sides = np.bincount(shared.of_cell.ravel(), weights=shared.sign.ravel(), minlength=len(shared.nodes))
@@ -165,8 +166,8 @@ def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[
 def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Nodes of the facets that belong to one cell only, (B, n) int64, turned to face outwards.
 
-    For positively oriented cells the returned triangles (edges in 2-D) have their normal pointing out. `shared` are
-    the cells' facets where they are known already.
+    For positively oriented cells the normals of the returned triangles (edges in 2-D) point outwards. `shared` are the
+    cells' facets, if already known.
     """
     shared = facets(cells) if shared is None else shared
     is_outer = shared.n_cells == 1
@@ -182,12 +183,12 @@ def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) ->
 def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArray:
     """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
 
-    `start` and `star_cells` are the rows of `Stars`, cells int64 and contiguous. Greedy in node order, so the same mesh
-    always gets the same colours. Nodes of one colour can move at the same time: their stars have no cell in common.
+    `start` and `star_cells` are the rows of `Stars`, cells int64 and contiguous. Greedy in node order, so that the same
+    mesh always gets the same colours. Nodes of one colour can move at the same time: their stars share no cell.
     """
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
-    taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node that saw this colour beside it
+    taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node with a neighbour of this colour
     for node in range(n_nodes):
         for r in range(start[node], start[node + 1]):
             for k in range(cells.shape[1]):
@@ -202,14 +203,14 @@ def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArr
 
 
 def linked(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
-    """How many connected sets n things fall into, of which one[i] and other[i] are linked, and each thing's, (n,)."""
+    """Number of connected sets of n items linked in pairs one[i], other[i], and the set of each item, (n,)."""
     graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
     count, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return int(count), number.astype(np.int64)
 
 
 def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Number of the connected set each cell belongs to, (M,) int64; cells that share a facet are connected.
+    """The connected set of each cell, (M,) int64; cells that share a facet are connected.
 
     Sets are numbered from 0 in the order of their first cell.
     """
@@ -223,9 +224,9 @@ def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def largest_component(cells: NDArray[np.integer], is_chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices of the largest facet-connected set among the chosen cells, ascending; the first of equals.
+    """Indices of the largest facet-connected set among the chosen cells, ascending; the first of equal sets.
 
-    The paper's display of the ventricles, Fig. 3(f): chosen are the cells with a mean below a threshold.
+    The paper displays the ventricles so, Fig. 3(f), choosing cells with a mean below a threshold.
     """
     chosen = np.flatnonzero(is_chosen)
     if len(chosen) == 0:

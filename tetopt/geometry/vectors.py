@@ -1,7 +1,7 @@
-"""Vectors of three numbers as tuples, for kernels that would else spell out every coordinate; whole numbers stay so.
+"""Vectors of three numbers as tuples, so that kernels need not spell out every coordinate; integers stay integers.
 
-LLVM is told to put them in the place of their calls. Put there by numba, before types are inferred, they ran as fast,
-and all kernels took a fifth longer to compile.
+LLVM inlines these functions. Inlined by numba, before type inference, they were as fast, but all kernels took a fifth
+longer to compile.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ def put_row(x: NDArray, i: int, u: tuple) -> None:
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 def difference(x: NDArray, i: int, k: int) -> tuple:
-    """Row i of x (R, 3) less its row k."""
+    """Row i of x (R, 3) minus row k."""
     return x[i, 0] - x[k, 0], x[i, 1] - x[k, 1], x[i, 2] - x[k, 2]
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 def minus(u: tuple, v: tuple) -> tuple:
-    """u less v."""
+    """u minus v."""
     return u[0] - v[0], u[1] - v[1], u[2] - v[2]
 
 

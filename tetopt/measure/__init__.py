@@ -1,1 +1,1 @@
-"""What came of it: quality, fidelity to masks and labels, segmentation."""
+"""Measures of a mesh: quality, fidelity to masks and labels, segmentation."""

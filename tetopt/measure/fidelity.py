@@ -1,8 +1,8 @@
-"""How well a mesh represents given labels, or a given mask: overlaps, distances between surfaces, connected components.
+"""Fidelity of a mesh to labels or a mask: overlaps, distances between surfaces, connected components.
 
 A label's surface in the image is its half level: marching cubes at 1/2 of the array that is 1 in the label's voxels and
-0 elsewhere. Its surface in the mesh are the facets between the cells that carry the label and those that do not. The
-faces of the image's box belong to neither, nor are distances measured to them: what lies behind them is not known.
+0 elsewhere. Its surface in the mesh consists of the facets between cells with the label and other cells. The faces of
+the image's box belong to neither, and distances exclude them, as the space behind them is unknown.
 
 Distances are exact, from points spread evenly over one surface to the other, so that means and percentiles are by area.
 """
@@ -28,19 +28,19 @@ from tetopt.geometry.topology import Facets, components, facets, lexicographic_o
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
-POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
-MOST_POINTS = 20_000  # on a surface, from which distances are measured
-FEWEST_POINTS = 1_000  # the same on the larger of two surfaces, however small
-POINTS_PER_FACE = 4.0  # on an area as large as a voxel's face: the half level bends no faster than that
+POINTS_PER_CELL = 24  # points per cell for comparison with the voxels
+MOST_POINTS = 20_000  # on a surface, for measuring distances
+FEWEST_POINTS = 1_000  # the least number on the larger of two surfaces
+POINTS_PER_FACE = 4.0  # per area of a voxel's face: the half level bends no faster than that
 # Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1 (Roberts 2018).
 EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
 
 class FacetSurface(NamedTuple):
-    """Triangles in space, or segments in the plane; they need not close."""
+    """Triangles in space, or segments in the plane; the surface may be open."""
 
     points: NDArray[np.float64]  # (P, n)
-    facets: NDArray[np.int64]  # (T, n), which points; not turned to any side
+    facets: NDArray[np.int64]  # (T, n), indices of points; not oriented
 
 
 class Thickness(NamedTuple):
@@ -49,7 +49,7 @@ class Thickness(NamedTuple):
     Parameters
     ----------
     p5, p50, p95 : float
-        The 5th percentile, the median and the 95th, over the voxels' centres in the label, mm.
+        The 5th percentile, the median and the 95th percentile over the voxel centres in the label, mm.
 
     Examples
     --------
@@ -63,28 +63,28 @@ class Thickness(NamedTuple):
 
 
 class LabelFidelity(NamedTuple):
-    """What the mesh makes of one label. Volumes are areas in 2-D.
+    """Fidelity of the mesh to one label. Volumes are areas in 2-D.
 
     Parameters
     ----------
     label : int
         The label's number.
     voxels : int
-        How many voxels have it.
+        Number of its voxels.
     volume : float
-        Of these voxels, mm^n.
+        Volume of these voxels, mm^n.
     mesh_volume : float
-        Of the cells that carry it, mm^n.
+        Volume of its cells, mm^n.
     n_cells : int
-        How many cells carry it.
+        Number of its cells.
     n_empty_cells : int
-        How many of them hold no voxel centre.
+        Number of its cells without voxel centre.
     dice : float
-        Of the voxels in these cells with the voxels that have it, 0 to 1.
+        Dice of the voxels in its cells with its voxels, 0 to 1.
     volume_dice : float
-        Of the cells with the voxels as boxes: what cells as small as voxels cannot get around.
+        Dice of its cells with its voxels as boxes, which cells as small as voxels cannot evade.
     distance_mean : float
-        Between its surface in the mesh and in the image, both ways, mm; nan without one of them.
+        Mean distance between its surfaces in the mesh and in the image, both ways, mm; nan if one is missing.
     distance_p95 : float
         95th percentile of the same, mm.
     components : int
@@ -92,13 +92,14 @@ class LabelFidelity(NamedTuple):
     mesh_components : int
         Connected components of its cells, linked by facets.
     is_lost : bool
-        Nothing of the mesh carries it.
+        True if no part of the mesh has the label.
     distance_max : float
-        The largest of the distances, mm: of single spikes, which a percentile does not see.
+        The largest distance, mm: it shows single spikes, unlike a percentile.
     one_layer_fraction : float
-        Fraction of its cells' volume in cells whose nodes all lie on its surface: one cell thick; nan without cells.
+        Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick; nan without cells.
     thickness_voxels, thickness_mesh : Thickness, optional
-        Of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None where not measured.
+        Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
+        measured.
 
     Examples
     --------
@@ -129,25 +130,25 @@ class LabelFidelity(NamedTuple):
 
 
 class MaskFidelity(NamedTuple):
-    """What a mesh that should fill a mask makes of it. Volumes are areas in 2-D.
+    """Fidelity of a mesh to the mask that it should fill. Volumes are areas in 2-D.
 
-    Distances are between the mesh's boundary and the mask's half level, off the faces of the box; nan without one of
-    them. Those in voxels are measured in index space, where every voxel is a unit cube, those in mm in the world.
+    Distances are between the mesh's boundary and the mask's half level, off the faces of the box; nan if one is
+    missing. They are in index space if in voxels, where every voxel is a unit cube, and in the world if in mm.
 
     Parameters
     ----------
     voxels : int
-        How many voxels are of 1/2 or more.
+        Number of voxels of 1/2 or more.
     volume : float
-        Of these voxels, mm^n.
+        Volume of these voxels, mm^n.
     mesh_volume : float
-        Of all cells, mm^n.
+        Volume of all cells, mm^n.
     dice : float
-        Of the voxels inside the mesh with those of 1/2 or more, 0 to 1.
+        Dice of the voxels inside the mesh with those of 1/2 or more, 0 to 1.
     distance_mean, distance_p95 : float
-        From the mesh's boundary to the mask's, voxels: the mean and the 95th percentile.
+        Distance from the mesh's boundary to the mask's, voxels: the mean and the 95th percentile.
     reverse_mean, reverse_p95 : float
-        From the mask's boundary to the mesh's, voxels.
+        Distance from the mask's boundary to the mesh's, voxels: the same.
     distance_mean_mm, distance_p95_mm, reverse_mean_mm, reverse_p95_mm : float
         The same four in mm.
     components : int
@@ -155,9 +156,9 @@ class MaskFidelity(NamedTuple):
     mesh_components : int
         Connected components of the cells, linked by facets.
     euler : int
-        Euler characteristic of the mask's half level: 2 for each closed component, 2 less for each handle.
+        Euler characteristic of the mask's half level: 2 for each closed component, minus 2 for each handle.
     mesh_euler : int
-        Of the mesh's boundary; both without what lies on the box, 1 for a disc that ends there.
+        Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends there has 1.
 
     Examples
     --------
@@ -188,9 +189,9 @@ class MaskFidelity(NamedTuple):
 
 
 def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
-    """The label of each cell: the one that most of its voxels have, of equally many the smallest.
+    """The label of each cell: the most frequent one among its voxels, the smallest of equally frequent ones.
 
-    A cell that holds no voxel centre has the label of the voxel nearest to its centroid.
+    A cell without voxel centre has the label of the voxel nearest to its centroid.
 
     Parameters
     ----------
@@ -223,10 +224,10 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
 
 
 def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) -> list[LabelFidelity]:
-    """How well the cells show each label of an image.
+    """Measure how well cells represent each label of an image.
 
-    What lies outside of the mesh counts as label 0, as the background around the mesh of a mask: its voxels are
-    painted 0, the mesh's boundary off the box is a surface between 0 and what is inside, and 0 is not lost there.
+    The space outside the mesh counts as label 0, like the background around the mesh of a mask: its voxels get label 0,
+    the mesh's boundary off the box is a surface between 0 and the labels inside, and label 0 is not lost there.
 
     Parameters
     ----------
@@ -235,12 +236,12 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     mesh : Mesh
         Points in world mm.
     of_cell : (M,) array of whole numbers, optional
-        Label that each cell carries; `cell_labels` by default.
+        Label of each cell; `cell_labels` by default.
 
     Returns
     -------
     list of LabelFidelity
-        One for each label in the image, ascending, 0 among them.
+        One for each label in the image including 0, ascending.
 
     Raises
     ------
@@ -306,13 +307,13 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
 def _overlaps(
     labels: Image, mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
 ) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Volume of each label's voxels within the cells that carry it, and outside of the mesh: of label 0, of anything.
+    """Volume of each label's voxels in its cells and, for label 0, outside the mesh; and of all labels there.
 
-    From points that fill each cell evenly, `POINTS_PER_CELL` of them.
+    Estimated from `POINTS_PER_CELL` points that fill each cell evenly.
     """
     n, size = mesh.ndim, volumes(mesh.points, mesh.cells)
     steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, POINTS_PER_CELL + 1), EVEN_STEPS[3][:n]), 1.0), axis=1)
-    weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are even in a simplex
+    weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are uniform in a simplex
     own, none = np.zeros(len(size)), np.zeros(len(size))
     for weight in weights:
         labels_there = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
@@ -325,7 +326,7 @@ def _overlaps(
 
 
 def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
-    """How well a mesh fills a mask, and its boundary follows the mask's.
+    """Measure how well a mesh fills a mask and follows its boundary.
 
     Parameters
     ----------
@@ -385,10 +386,10 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
 
 
 def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurface:
-    """The surface on which a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in 2-D).
+    """The surface where a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in 2-D).
 
-    Beyond the outermost voxel centres the field goes on as it is there, so the surface runs straight on to the faces
-    of the box, ends there, and has no part on them.
+    Beyond the outermost voxel centres the field is constant, so the surface continues straight to the faces of the
+    box, ends there, and has no part on them.
 
     Parameters
     ----------
@@ -400,7 +401,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     Returns
     -------
     FacetSurface
-        In world mm, exact to 1e-5 voxel; without facets where the field does not cross 1/2.
+        World mm, accurate to 1e-5 voxel; without facets if the field does not cross 1/2.
     """
     import pyvista  # slow to load, and only needed with a mask or labels
 
@@ -410,9 +411,9 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     grid = pyvista.ImageData(dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n))
     grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(order="F")
     surface = grid.contour([INSIDE_FRACTION], scalars="level", compute_normals=False, compute_gradients=False)
-    listed = surface.faces if n == 3 else surface.lines  # the points of each come after their number
+    listed = surface.faces if n == 3 else surface.lines  # the points of each follow their number
     # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
-    # copy, one voxel out, has the same place along the others at the face of the box, half a voxel out.
+    # copy, one voxel out, has the same coordinates along the other axes at the face of the box, half a voxel out.
     index = np.clip(np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5)
     return FacetSurface(
         transformed(index, affine[:-1, :-1]) + affine[:-1, -1], listed.reshape(-1, n + 1)[:, 1:].astype(np.int64)
@@ -422,7 +423,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
 def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDArray[np.float64]:
     """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit; exact.
 
-    The surface has one facet or more; flat ones count, too.
+    The surface has at least one facet; flat facets count, too.
     """
     corners = surface.points[surface.facets]
     if points.shape[1] == 2:  # segments are flat triangles
@@ -431,18 +432,18 @@ def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDA
 
 
 def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D); always the same ones.
+    """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D); deterministic.
 
-    `areas` (T,) are its facets', if they are known.
+    `areas` (T,) are its facets' areas, if known.
 
-    The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of it. Where in the
-    part changes from point to point: always in its middle, every second of equal facets could be left out.
+    The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of it. Its place in the
+    part varies from point to point: points in the middle could skip every second of equal facets.
     """
     points, nodes = surface
     place = np.arange(1, count + 1)[:, None] * EVEN_STEPS[points.shape[1]] % 1.0
     end = np.cumsum(surface_areas(surface) if areas is None else areas)
     at = np.searchsorted(end, (np.arange(count) + place[:, 0]) / count * end[-1], side="right")
-    at, place = np.minimum(at, len(nodes) - 1), place[:, 1:]  # rounding may pass the last
+    at, place = np.minimum(at, len(nodes) - 1), place[:, 1:]  # rounding may exceed the last
     is_beyond = place.sum(axis=1) > 1.0
     place[is_beyond] = 1.0 - place[is_beyond]  # from the far half of the parallelogram into the triangle
     first = points[nodes[at, 0]]
@@ -450,7 +451,7 @@ def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] 
 
 
 def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
-    """Points less edges plus triangles of a surface (T, 3); points less segments of a curve (T, 2)."""
+    """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve (T, 2)."""
     if len(surface_facets) == 0:
         return 0
     nodes, total = np.sort(surface_facets, axis=1).T, 0
@@ -462,7 +463,7 @@ def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
 
 
 def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """`cell_labels` from the cell of each voxel; only the pairs of cell and label that occur are counted."""
+    """`cell_labels` from the cell of each voxel, counting only pairs of cell and label that occur."""
     is_in_mesh = owner >= 0
     pairs = owner[is_in_mesh] * (LARGEST_LABEL + 1) + labels.data[is_in_mesh].astype(np.int64)
     pairs, counts = np.unique(pairs, return_counts=True)
@@ -475,12 +476,12 @@ def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np
 
 
 def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Label of the cell that owns each voxel, of the image's shape; -1 outside of the mesh."""
+    """Label of the cell that owns each voxel, in the image's shape; -1 outside the mesh."""
     return np.where(owner >= 0, of_cell[owner], -1)
 
 
 def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
-    """One label for each cell, (M,) int64; InputError unless there are whole numbers from 0 to `LARGEST_LABEL`."""
+    """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0 to `LARGEST_LABEL`."""
     values = np.asarray(of_cell)
     if values.shape != (len(mesh.cells),):
         raise InputError(
@@ -498,9 +499,9 @@ def _counts(values: NDArray, weights: NDArray | None = None) -> NDArray:
 
 
 def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:
-    """Fraction of each label's volume in cells whose nodes all lie on its surface, by label; `shared` are its facets.
+    """Fraction of each label's volume in cells whose nodes all lie on its surface; `shared` are the mesh's facets.
 
-    The surface is that of the label's cells to all else, the outside of the mesh among it.
+    The surface separates the label's cells from everything else, including the outside of the mesh.
     """
     near, far = np.where(shared.cells >= 0, of_cell[shared.cells], -1).T
     is_surface = near != far
@@ -517,10 +518,10 @@ def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) 
 def _labels_beside_facets(
     labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All facets (F, n), and the labels on their two sides (F, 2): outside is 0, behind the box what is before it."""
+    """All facets (F, n) and the labels on both sides (F, 2): 0 outside, and the same label on both sides of the box."""
     sides = of_cell[shared.cells]
     is_outer = shared.n_cells == 1
-    is_on_box = facets_on_box(mesh, labels)[1]  # in the same order
+    is_on_box = facets_on_box(mesh, labels)[1]  # in the order of the facets
     sides[is_outer, 1] = np.where(is_on_box, sides[is_outer, 0], 0)
     return shared.nodes, sides
 
@@ -528,7 +529,7 @@ def _labels_beside_facets(
 def _with_margin(
     labels: Image, data: NDArray[np.int32], box: tuple[slice, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """The part of an array in a box and one voxel around, if there is one, and the part's affine."""
+    """The part of an array in a box with a margin of one voxel, where available, and the part's affine."""
     low = np.array([max(side.start - 1, 0) for side in box])
     affine = labels.affine.copy()
     affine[:-1, -1] = labels.to_world(low)
@@ -536,12 +537,12 @@ def _with_margin(
 
 
 def _face(voxel_volume: float, n: int) -> float:
-    """Area (length in 2-D) of a face of the cube as large as a voxel."""
+    """Area (length in 2-D) of a face of a cube with the volume of a voxel."""
     return voxel_volume ** ((n - 1) / n)
 
 
 def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From points of each of two surfaces to the other, equally dense on both; no points if a surface is empty."""
+    """Distances from equally dense points on each of two surfaces to the other; none if a surface is empty."""
     if len(one.facets) == 0 or len(other.facets) == 0:
         return np.empty(0), np.empty(0)
     areas, areas_there = surface_areas(one), surface_areas(other)
@@ -554,7 +555,7 @@ def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDA
 
 
 def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
-    """Area of each triangle, length of each segment, (T,) float64."""
+    """Area of each triangle, or length of each segment, (T,) float64."""
     nodes = surface.facets.T
     corners = [np.ascontiguousarray(axis)[nodes] for axis in surface.points.T]  # axis by axis: three times as fast
     along = [corner[1:] - corner[0] for corner in corners]
@@ -579,12 +580,12 @@ def _n_components(cells: NDArray[np.int64]) -> int:
 
 
 class ImageFit(NamedTuple):
-    """How well the cells of a mesh fit an image."""
+    """Fit of the cells of a mesh to an image."""
 
     E_D: float  # intensity^2 mm^n
-    E_D_fraction_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
+    E_D_fraction_of_variance: float | None  # over the voxels that the mesh covers; None if they are all equal
     n_voxels: int  # voxel centres inside
-    n_empty_cells: int  # cells without one
+    n_empty_cells: int  # cells without voxel centre
     overlap: Overlap | None  # voxels that lie in several cells
 
 
@@ -594,13 +595,13 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
     Raises
     ------
     InputError
-        A mesh that covers none.
+        The mesh contains no voxel centre.
     """
     moments = cell_moments(image, mesh)
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     n_voxels = int(moments.n_voxels.sum())
     if n_voxels == 0:
-        raise InputError("mesh and image: no voxel centre lies inside the mesh; do both lie in the same world mm?")
+        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
     mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
     spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
     n_empty = int((moments.n_voxels == 0).sum())

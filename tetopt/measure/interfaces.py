@@ -1,12 +1,12 @@
-"""How smooth, whole and manifold the surfaces of labels are.
+"""Smoothness, connectivity and manifoldness of the surfaces of labels.
 
-A label's surface are the facets between the cells that carry it and all else: other labels, and what lies outside of
-the mesh, so that it is closed. It is compared with a smooth surface of the label's voxels, closed likewise:
-surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D. These shrink what is small: a
-perfect ball has 1.16 times their area at a radius of 6 voxels, 1.04 at 12 and 1.01 at 20, a tube 1.15 at 4, 1.07 at 8.
+A label's surface consists of the facets between its cells and everything else: other labels, and the outside of the
+mesh, so that it is closed. It is compared with a closed smooth surface of the label's voxels: surface nets (Gibson
+1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D. These shrink small shapes: a perfect ball has 1.16
+times their area at a radius of 6 voxels, 1.04 at 12 and 1.01 at 20; a tube 1.15 at 4, 1.07 at 8.
 
-Connected components, holes and cavities are those of the label's inside, without its surface: cells hang together by
-facets, voxels by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge or a node alone has no
+Connected components, holes and cavities are those of the label's inside, without its surface: cells are connected by
+facets and voxels by faces (6 neighbours, and 26 outside), so that a ring that closes only in an edge or a node has no
 hole.
 """
 
@@ -27,45 +27,45 @@ from tetopt.image import Image, transformed
 from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, surface_areas
 from tetopt.mesh import Mesh
 
-FOLD_DEGREES = 60.0  # by which the normals at a ridge turn where it is folded; a dihedral angle under 120 degrees
-NET_ITERATIONS = 16  # of the relaxation of surface nets, and the next: VTK's own values
-NET_VOXELS = {2: 34, 3: 200}  # by dimension: the nets of fewer shrink by half of their area and more
-NET_RELAXATION = 0.5  # the fraction of the way to the neighbours' mean that a point goes in each
+FOLD_DEGREES = 60.0  # least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
+NET_ITERATIONS = 16  # of the relaxation of surface nets; these values are VTK's
+NET_VOXELS = {2: 34, 3: 200}  # by dimension: with fewer voxels the nets shrink by half of their area or more
+NET_RELAXATION = 0.5  # fraction of the way to the neighbours' mean that a point moves in each
 
 
 class LabelInterface(NamedTuple):
-    """What a label's surface is like. In 2-D areas are lengths, and edges are nodes.
+    """Properties of a label's surface. In 2-D areas are lengths, and edges are nodes.
 
     Parameters
     ----------
     label : int
         The label's number.
     area : float
-        Of its surface in the mesh, mm^(n-1).
+        Area of its surface in the mesh, mm^(n-1).
     smooth_area : float
-        Of the smooth surface of its voxels, mm^(n-1).
+        Area of the smooth surface of its voxels, mm^(n-1).
     area_ratio : float
-        Of the two; nan without cells, or of fewer voxels than `NET_VOXELS`.
+        Ratio of the two; nan without cells, or with fewer voxels than `NET_VOXELS`.
     folded : float
         Fraction of the surface's edges at which it turns by more than 60 degrees; nan without cells.
     n_facets : int
-        How many facets its surface has.
+        Number of facets of its surface.
     nonmanifold_edges : int
-        How many edges are in more than two of its facets.
+        Number of edges in more than two of its facets.
     nonmanifold_edges_two_labels : int
-        Those around which it meets one other label alone, or the outside alone.
+        Number of these edges around which it meets only one other label, or only the outside.
     nonmanifold_nodes : int
-        How many nodes there are around which its facets form more than one fan, over edges; 0 in 2-D.
+        Number of nodes around which its facets form more than one fan, over edges; 0 in 2-D.
     nonmanifold_nodes_two_labels : int
-        Those around which it meets one other label alone, or the outside alone.
+        Number of these nodes around which it meets only one other label, or only the outside.
     euler : int
-        Of its voxels' closed surface: 2 (components - holes + cavities); the same in 2-D, where no curve has one.
+        Euler number of its voxels' closed surface: 2 (components - holes + cavities); the same formula in 2-D.
     mesh_euler : int
-        Of its cells' closed surface.
+        Euler number of its cells' closed surface.
     cavities : int
-        Shut in within its voxels; 0 in 2-D, where they are holes.
+        Number of cavities in its voxels; 0 in 2-D, where they are holes.
     mesh_cavities : int
-        Shut in within its cells, likewise.
+        Number of cavities in its cells; 0 in 2-D.
 
     Examples
     --------
@@ -94,21 +94,21 @@ class LabelInterface(NamedTuple):
 
 
 def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[LabelInterface]:
-    """How smooth, whole and manifold the surface of each label of an image is.
+    """Measure the smoothness, connectivity and manifoldness of the surface of each label of an image.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        A conforming one.
+        A conforming mesh.
     of_cell : (M,) array of whole numbers
-        Label that each cell carries, such as `tetopt.measure.fidelity.cell_labels`.
+        Label of each cell, such as from `tetopt.measure.fidelity.cell_labels`.
 
     Returns
     -------
     list of LabelInterface
-        One for each label in the image, ascending, 0 among them.
+        One for each label in the image including 0, ascending.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     n_labels = int(max(of_cell.max(), present.max())) + 1
 
     def counts(which: NDArray[np.int64], weights: NDArray | None = None) -> NDArray:
-        """Of labels, without what is outside."""
+        """Counts by label, without the outside."""
         return np.bincount(which[which >= 0], None if weights is None else weights[which >= 0], n_labels)
 
     edges, nodes, turns = ridges.n_facets > 2, fans.n_fans > 1, _turns(mesh.points, surfaces, ridges)
@@ -173,15 +173,15 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
 
 
 def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> FacetSurface:
-    """Surface nets of a label's voxels, in mm; not moved to their place in the world.
+    """Surface nets of a label's voxels, in mm, without the translation to their place in the world.
 
-    Points of the nets go halfway to their neighbours' mean, again and again, within a voxel's diagonal of where they
-    were: as `pyvista.ImageDataFilters.contour_labels` has it, to the same numbers, and in the plane likewise.
+    Points of the nets move repeatedly halfway to their neighbours' mean, within a voxel's diagonal of their origin,
+    with the same numbers as `pyvista.ImageDataFilters.contour_labels`; the same is done in the plane.
 
     Parameters
     ----------
     is_label : (s_0, ..., s_{n-1}) bool
-        False in the outermost voxels, or else the surface is open there.
+        False in the outermost voxels; otherwise the surface is open there.
     affine : (n+1, n+1) float64
         Index -> world mm.
     """
@@ -196,7 +196,7 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
     nets = vtkSurfaceNets2D() if n == 2 else vtkSurfaceNets3D()
     nets.SetInputData(grid)
     nets.SetBackgroundLabel(0)
-    for value in (0, 1):  # without the first VTK relaxes edges at which voxels touch in another way
+    for value in (0, 1):  # without the first, VTK relaxes edges at which voxels touch differently
         nets.SetLabel(value, value)
     nets.SmoothingOn()
     smoother = nets.GetSmoother()
@@ -215,11 +215,11 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
 
 
 def voxel_euler(is_label: NDArray[np.bool_]) -> int:
-    """Euler number of the closed surface of voxels that hang together by faces.
+    """Euler number of the closed surface of voxels that are connected by faces.
 
-    That is twice the number of what it encloses: voxels, less pairs that share a face, plus fours around an edge, less
-    eights around a corner, for 6 neighbours inside and 26 outside (Kong and Rosenfeld 1989). In 2-D likewise: pixels,
-    less pairs, plus fours.
+    It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus groups of four
+    around an edge, minus groups of eight around a corner, for 6 neighbours inside and 26 outside (Kong and Rosenfeld
+    1989). In 2-D: pixels, minus pairs, plus groups of four.
     """
     n, total = is_label.ndim, 0
     for is_joined in product((False, True), repeat=n):
@@ -233,14 +233,14 @@ def voxel_euler(is_label: NDArray[np.bool_]) -> int:
 
 
 def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
-    """How many parts of what is around voxels are shut in; corners let through. None in 2-D."""
+    """Number of enclosed components of the space around voxels, which corners connect; 0 in 2-D."""
     if is_label.ndim == 2:
         return 0
     return int(scipy.ndimage.label(~np.pad(is_label, 1), np.ones((3,) * is_label.ndim))[1]) - 1
 
 
 def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges) -> NDArray[np.float64]:
-    """Angle between the normals of the two facets at each ridge, (R,), degrees; nan where there are more."""
+    """Angle between the normals of the two facets at each ridge, (R,), degrees; nan with more facets."""
     corners = points[surfaces.nodes]
     along = corners[:, 1:] - corners[:, :1]
     if points.shape[1] == 2:
@@ -253,7 +253,7 @@ def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges)
     paired = np.flatnonzero(ridges.n_facets == 2)
     cosine = (normals[of_ridge[first[paired]]] * normals[of_ridge[first[paired] + 1]]).sum(axis=1)
     turns = np.full(len(ridges.n_facets), np.nan)
-    turns[paired] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).round(6)  # 60 on lattices is no more than 60
+    turns[paired] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).round(6)  # 60 on lattices must not exceed 60
     return turns
 
 
@@ -264,9 +264,9 @@ def _cell_eulers(
     n_ridges: NDArray[np.int64],
     n_nodes: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """`voxel_euler` of each label's cells: those, less the facets between them, plus edges, less nodes in their midst.
+    """`voxel_euler` of each label's cells: cells, minus facets between them, plus inner edges, minus inner nodes.
 
-    `n_ridges` and `n_nodes` are those of each label's surface, which are not in its midst.
+    `n_ridges` and `n_nodes` are those of each label's surface, which are not inner ones.
     """
     n, n_labels, base = cells.shape[1] - 1, len(n_nodes), int(cells.max()) + 1
     near, far = of_cell[shared.cells].T
@@ -284,7 +284,7 @@ def _cell_eulers(
 def _cell_cavities(
     shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int
 ) -> NDArray[np.int64]:
-    """`voxel_cavities` of each label's cells: what is around them hangs together by nodes."""
+    """`voxel_cavities` of each label's cells: nodes connect the space around them."""
     cavities = np.zeros(n_labels, dtype=np.int64)
     if cells.shape[1] == 3:
         return cavities
@@ -298,7 +298,7 @@ def _cell_cavities(
     )
     node, piece = np.divmod(meets, n_pieces + 1)
     pairs = [np.empty((0, 2), dtype=np.int64)]
-    for step in range(1, int(np.bincount(node).max())):  # all pieces of a node with one another
+    for step in range(1, int(np.bincount(node).max())):  # link all components at a node
         is_same = node[step:] == node[:-step]
         pairs.append(np.column_stack([piece[:-step], piece[step:]])[is_same])
     one, other = np.unique(np.vstack(pairs), axis=0).T

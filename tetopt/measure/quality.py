@@ -1,4 +1,4 @@
-"""How good the cells are: the paper's four errors, histograms, angles and the kinds of bad cells."""
+"""Quality of cells: the paper's four errors, histograms, angles and the kinds of bad cells."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared
 from tetopt.interop import notebook
 
 BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
-SHORT_EDGE = 0.25  # of the longest: an edge shorter than this makes a flat cell a wedge
-NEAR_EDGE = 0.1  # barycentric: a projected node nearer to an edge than this makes a cap a spade
-BLOCK_CELLS = 2**18  # looked at together: 160 MB
+SHORT_EDGE = 0.25  # of the longest: a shorter edge makes a flat cell a wedge
+NEAR_EDGE = 0.1  # barycentric: a projected node nearer to an edge makes a cap a spade
+BLOCK_CELLS = 2**18  # processed at a time: 160 MB
 
 
 class QualityErrors(NamedTuple):
@@ -47,9 +47,9 @@ class QualityErrors(NamedTuple):
 def quality_errors(points: Points, cells: Cells) -> QualityErrors:
     """The paper's four errors of the radius ratio rho.
 
-    (ii) is printed as 1 / sum(1 / err); Table 1 fits M / sum(1 / err), the harmonic mean, and that is taken: its
-    third row, 196 congruent triangles, has (ii) equal to (i). (iii) is the plain sum of squares. An error that
-    rounding made negative is 0, and (ii) is 0 where any error is.
+    The paper prints (ii) as 1 / sum(1 / err), but its Table 1 fits M / sum(1 / err), the harmonic mean, which is used
+    here: in the table's third row, 196 congruent triangles, (ii) equals (i). (iii) is the plain sum of squares. An
+    error that rounding makes negative is 0, and (ii) is 0 if any error is 0.
     """
     return _errors_of(rho(points, cells), points.shape[1])
 
@@ -68,19 +68,19 @@ def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[NDArray
 
 
 def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
-    """The kind of each cell, (M,) str: "good" where n rho >= 0.3, else how its shape fails.
+    """The kind of each cell, (M,) str: "good" if n rho >= 0.3, else the kind of bad shape.
 
-    Tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are flat or thin as the spread of the four
-    nodes along its principal axes tells: thin, if the middle spread is nearer to the smallest than to the largest
-    (geometric mean), and flat otherwise. Flat ones are told apart by the projection onto their plane:
+    Bad tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are thin or flat, depending on the spread of
+    the four nodes along its principal axes: thin if the middle spread is nearer to the smallest than to the largest
+    (geometric mean), flat otherwise. The projection onto their plane distinguishes flat ones:
 
-    - ``needle``: thin; all nodes near a line, no angle needs to be bad.
-    - ``wedge``: flat with two nodes close together (an edge under 1/4 of the longest).
+    - ``needle``: thin; all nodes near a line, angles may be good.
+    - ``wedge``: flat with two nodes close together (an edge below 1/4 of the longest).
     - ``cap``: flat, one node projected inside the triangle of the others.
     - ``spade``: flat, one node projected (nearly) onto an edge of that triangle.
     - ``sliver``: flat, the projections form a convex quadrilateral; no short edge, two angles near 180 degrees.
 
-    Triangles: ``needle`` has an edge under 1/4 of the longest, ``cap`` an angle near 180 degrees.
+    Triangles: ``needle`` has an edge below 1/4 of the longest, ``cap`` an angle near 180 degrees.
     """
     return _kinds_of(points, cells, rho(points, cells))
 
@@ -120,23 +120,23 @@ class Quality(NamedTuple):
     Parameters
     ----------
     ndim : {2, 3}
-        n.
+        Dimension n.
     n_nodes, n_cells : int
-        Of the mesh.
+        Numbers of nodes and cells.
     volume, smallest_volume : float
-        Of all cells, and of the smallest, mm^n.
+        Total volume, and that of the smallest cell, mm^n.
     mean_rho, p1_rho, min_rho : float
-        Radius ratio: the mean, the 1st percentile, the smallest; 1/n is a regular cell.
+        Mean, 1st percentile and minimum of the radius ratio; a regular cell has 1/n.
     errors : QualityErrors
-        The paper's four.
+        The paper's four errors.
     min_dihedral, p1_dihedral, max_dihedral : float
-        The smallest angle, the 1st percentile of the cells' smallest angles, the largest, degrees.
+        Smallest angle, 1st percentile of the cells' smallest angles, and largest angle, degrees.
     n_under_10_degrees : int
-        Cells with a smallest angle below.
+        Number of cells with a smallest angle below 10 degrees.
     kinds : dict of str to int
         Counts of bad cells by kind.
     min_edge, max_edge : float
-        mm.
+        Shortest and longest edge, mm.
 
     Examples
     --------
@@ -181,17 +181,17 @@ class Quality(NamedTuple):
 
 
 def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:
-    """Rho, volume, smallest and largest angle, and squares of the shortest and longest edge, (M,) each."""
+    """Rho, volume, smallest and largest angle, and squares of the shortest and longest edge of cells, (M,) each."""
     angles, squares = dihedral_angles(points, cells), squared_edges(points, cells)
     extremes = angles.min(axis=1), angles.max(axis=1), squares.min(axis=1), squares.max(axis=1)
     return rho(points, cells), volumes(points, cells), *extremes
 
 
 def quality(points: Points, cells: Cells) -> Quality:
-    """Everything about the shape of a mesh's cells.
+    """Measure the shape of a mesh's cells.
 
-    Of rho and the four errors see Section 2.1 of the paper (`tetopt.measure.quality.quality_errors`), of the kinds of
-    bad cells `tetopt.measure.quality.bad_kinds`, of angles `tetopt.geometry.simplex.dihedral_angles`.
+    For rho and the four errors see Section 2.1 of the paper (`tetopt.measure.quality.quality_errors`), for the kinds of
+    bad cells `tetopt.measure.quality.bad_kinds`, for angles `tetopt.geometry.simplex.dihedral_angles`.
 
     Parameters
     ----------
@@ -208,11 +208,11 @@ def quality(points: Points, cells: Cells) -> Quality:
     Raises
     ------
     InputError
-        Points or cells that are no tables of numbers.
+        Points or cells that are not 2-D arrays of numbers.
 
     See Also
     --------
-    check_mesh : Whether it is a mesh at all.
+    check_mesh : List the defects of a mesh.
 
     Examples
     --------
@@ -223,7 +223,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     (300, True)
     """
     n = points.shape[1]
-    # Block by block: of all cells at a time what shapes are computed from takes 600 bytes each.
+    # Block by block, as the temporaries take 600 bytes per cell.
     blocks = [_of_cells(points, cells[at : at + BLOCK_CELLS]) for at in range(0, len(cells), BLOCK_CELLS)]
     shape, v, smallest, largest, shortest, longest = (np.concatenate(each) for each in zip(*blocks, strict=True))
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")

@@ -1,4 +1,4 @@
-"""The requirements of `tetopt mesh`, judged on a mesh of any origin."""
+"""Check the requirements of `tetopt mesh` on a mesh of any origin."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def judged(
     target_error: float | None = None,
     is_filled: bool = False,
 ) -> MeshingResult:
-    """A mesh as the result of a run that ended with it: its `violated` and `fraction` are those of that run.
+    """Treat a mesh as the result of a run, with the `violated` and `fraction` that the run would have.
 
     Parameters
     ----------
@@ -33,19 +33,19 @@ def judged(
     min_dihedral : float
         The minimum dihedral angle, degrees; 0 for none.
     target_error : float, optional
-        The fraction of the variance that cells may leave unexplained.
+        The allowed unexplained fraction of the variance.
     is_filled : bool
-        The mesh should fill the image's box.
+        True if the mesh should fill the image's box.
 
     Returns
     -------
     MeshingResult
-        Its history has one row, with E_D and the number of voxels.
+        The result; its history has one row, with E_D and the number of voxels.
 
     Raises
     ------
     InputError
-        As `tetopt.energy.sampling.cell_moments`.
+        As for `tetopt.energy.sampling.cell_moments`.
     """
     E_D, n_voxels = content_E_D(content, mesh)
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)

@@ -1,4 +1,4 @@
-"""Approximate segmentation by an optimised mesh: cells grouped by their means, painted back to voxels.
+"""Approximate segmentation by an optimised mesh: cells are classified by their means, and voxels by their cells.
 
 Section 5 of the paper: "such an optimized discretization can further be used for a fast approximate segmentation since
 optimized elements represent an image using far fewer degrees-of-freedom than the underlying pixels".
@@ -18,38 +18,38 @@ from tetopt.mesh import Mesh
 
 
 def segment(image: Image, mesh: Mesh, classes: int) -> Image:
-    """Label image, 0 to classes - 1 by rising mean: the cells' classes painted back to their voxels.
+    """Segment an image into classes 0 to classes - 1 of increasing mean, from the classes of its cells.
 
     Parameters
     ----------
     image : Image
         The intensities h.
     mesh : Mesh
-        Of the image's box or a part of it.
+        Mesh of the image's box or a part of it.
     classes : int
-        2 or more.
+        Number of classes, 2 or more.
 
     Returns
     -------
     Image
-        Whole numbers, on the image's voxels.
+        Class of each voxel, whole numbers.
 
     Raises
     ------
     InputError
-        As `class_thresholds` and `tetopt.energy.sampling.cell_moments`; a mesh in which no voxel lies.
+        As for `class_thresholds` and `tetopt.energy.sampling.cell_moments`, or a mesh without voxel centres.
 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> labels = tetopt.segment(image, tetopt.mesh_image(image, 300, iterations=4).mesh, 2)
     >>> truth = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
-    >>> int((labels.data != truth.data).sum())  # voxels that are not as in the phantom
+    >>> int((labels.data != truth.data).sum())  # voxels that differ from the phantom
     20
     """
     moments = cell_moments(image, mesh)
     if not moments.n_voxels.any():
-        raise InputError("mesh and image: no voxel centre lies in the mesh; do both lie in the same world mm?")
+        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
     owner = cell_of_voxel(image, mesh)
@@ -57,22 +57,22 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
 
 
 def thresholded(image: Image, classes: int) -> Image:
-    """Label image, 0 to classes - 1: the same classes from the voxels themselves, no mesh between."""
+    """Segment an image into the same classes directly from its voxels, without a mesh."""
     thresholds = class_thresholds(image.data.ravel(), classes)
     return Image(np.digitize(image.data, thresholds), image.affine)
 
 
 def stands_for(labels: Image, truth: Image) -> dict[int, int]:
-    """For each class the true label that most of its voxels carry; arguments as for `dice`."""
+    """The most frequent true label of each class's voxels; arguments as for `dice`."""
     table = _table(labels, truth)
     return {int(c): int(table[c].argmax()) for c in np.flatnonzero(table.sum(axis=1))}
 
 
 def dice(labels: Image, truth: Image) -> dict[int, float]:
-    """Dice overlap of each true label with the classes that stand for it, 0 to 1.
+    """Dice overlap of each true label with the classes that represent it, 0 to 1.
 
-    A class stands for the true label that most of its voxels carry (`stands_for`); a true label for which no class
-    stands has 0. The truth chooses that, so more classes tend to overlap better.
+    A class represents the most frequent true label of its voxels (`stands_for`); a true label without any class has 0.
+    As the truth determines this assignment, more classes tend to overlap better.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Thin labels: their local thickness, and the contact of each two labels, in voxels and mesh.
+"""Thin labels: local thickness and contacts between labels, in voxels and mesh.
 
-Thickness is measured at the same voxel centres in both, between the labels' smooth surfaces and between the facets of
-the mesh, alike in both: the median of shells is within 3 % from voxels, 0.5 % from facets. A sheet that no voxel's
-centre lies in is not seen.
+Both thicknesses are measured in the same way at the same voxel centres, between the labels' smooth surfaces and between
+the facets of the mesh: the median for shells is within 3 % from voxels and 0.5 % from facets. A sheet that contains no
+voxel centre is missed.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, surface_areas
 from tetopt.mesh import Mesh
 
-THICK_VOXELS = 10.0  # edges of a voxel (its shortest): what is thicker counts as so thick
-STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # area of a smooth surface over that of voxels' faces, mean over directions
-TOLERATED_CONTACT = 1.2  # of the voxels' contact: what a mesh has more is excess
-LABEL_BASE = LARGEST_LABEL + 1  # numbers a pair of labels
+THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
+STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # mean ratio, over all directions, of a smooth surface to its voxels' faces
+TOLERATED_CONTACT = 1.2  # times the voxels' contact: more in a mesh is excess
+LABEL_BASE = LARGEST_LABEL + 1  # base of the number of a pair of labels
 
 
 class LabelContact(NamedTuple):
-    """How far two labels touch. In 2-D areas are lengths, mm.
+    """Contact between two labels. In 2-D areas are lengths, mm.
 
     Parameters
     ----------
     labels : (int, int)
-        The two, ascending.
+        The two labels, ascending.
     mesh_mm2 : float
         Area of the facets between their cells.
     voxels_mm2 : float
-        Area of the faces between their voxels times 2/3 (pi/4 in 2-D): a smooth surface's, in the mean over directions.
+        Area of the faces between their voxels times 2/3 (pi/4 in 2-D), which estimates the smooth surface's area.
     ratio : float
-        The mesh's over the voxels'; nan where their voxels do not touch.
+        Ratio of the mesh's area to the voxels'; nan if their voxels do not touch.
 
     Examples
     --------
@@ -62,9 +62,9 @@ class LabelContact(NamedTuple):
 
 
 def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None) -> list[LabelContact]:
-    """Area over which each two labels touch, in the mesh and in the voxels.
+    """Measure the contact area of each pair of labels, in the mesh and in the voxels.
 
-    Facets on the mesh's boundary, and faces of voxels on the box or on the mask, are between no two labels.
+    Facets on the mesh's boundary, and faces of voxels on the box or the mask's border, do not count.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     mesh : Mesh
         Points in world mm.
     of_cell : (M,) array of whole numbers
-        Label of each cell, such as `tetopt.cell_labels` returns.
+        Label of each cell, such as from `tetopt.cell_labels`.
     mask : Image, optional
-        On the same voxels; only those of 1/2 and more count.
+        Mask on the same voxels; only voxels of 1/2 or more count.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
     if mask is not None and mask.shape != labels.shape:
-        raise InputError(f"mask: expected the shape of labels, {labels.shape}, got {mask.shape}; resample it first")
+        raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
     shared = facets(mesh.cells)
     sides = of_cell[shared.cells]
     is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
@@ -116,7 +116,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
 
 
 def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
-    """Area, mm^(n-1), of pairs that do not touch in the voxels, and of all contact over 1.2 times the voxels'."""
+    """Contact area, mm^(n-1), of pairs that do not touch in the voxels, and in excess of 1.2 times the voxels'."""
     return {
         "false_mm2": float(sum(each.mesh_mm2 for each in contacts if each.voxels_mm2 == 0.0)),
         "excess_mm2": float(sum(max(each.mesh_mm2 - TOLERATED_CONTACT * each.voxels_mm2, 0.0) for each in contacts)),
@@ -124,7 +124,7 @@ def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
 
 
 def _voxel_contacts(labels: Image, inside: NDArray[np.bool_] | None) -> dict[int, float]:
-    """Area of each pair's faces between voxels that are inside, as smooth surfaces have it."""
+    """Contact area of each pair's voxels inside, as the area of smooth surfaces."""
     data = labels.data.astype(np.int32)
     total: dict[int, float] = {}
     for axis, edge in enumerate(labels.spacing):
@@ -150,13 +150,13 @@ def _by_pair(one: NDArray, other: NDArray, weights: NDArray[np.float64] | None =
 def label_thickness(
     what: Content, mesh: Mesh, of_cell: ArrayLike
 ) -> dict[int, tuple[Thickness | None, Thickness | None]]:
-    """Local thickness of each label, between the smooth surfaces of its voxels and between the facets of its cells.
+    """Measure the local thickness of each label, between its voxels' smooth surfaces and between its cells' facets.
 
     Parameters
     ----------
     what : Content
-        With labels whose interfaces are smooth: their levels are the smooth surfaces, and its voxels (finer ones where
-        slices are thick) the places at which both are measured.
+        A content with smooth labels: their levels give the smooth surfaces, and both are measured at its voxels (finer
+        ones if slices are thick).
     mesh : Mesh
         Points in world mm.
     of_cell : (M,) array of whole numbers
@@ -165,13 +165,13 @@ def label_thickness(
     Returns
     -------
     dict
-        By label, of its voxels and of its cells, each None without a voxel's centre in them. Values above ten edges of
-        a voxel (the shortest) are cut off there. On a mask both end half a voxel beyond the last centre inside.
+        For each label, the thickness of its voxels and of its cells, each None if they contain no voxel centre. Values
+        are clipped at ten times a voxel's shortest edge. At a mask both end half a voxel beyond the last centre inside.
 
     Raises
     ------
     InputError
-        A content without such labels, not one label a cell, or not enough memory.
+        A content without such labels, not one label per cell, or not enough memory.
 
     Examples
     --------
@@ -185,7 +185,7 @@ def label_thickness(
     of_cell = checked_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
     if members is None:
-        raise InputError("content: expected labels with smooth interfaces, got none; make it by content(image, labels)")
+        raise InputError("content: expected labels with smooth interfaces, got none; use content(image, labels)")
     inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)

@@ -1,1 +1,1 @@
-"""The first mesh: lattices, octree and its leaves' cells, sizes, clipping at a mask, Delaunay."""
+"""The initial mesh: lattices, octree and its leaves' cells, sizes, clipping at a mask, Delaunay."""

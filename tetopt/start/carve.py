@@ -1,4 +1,4 @@
-"""Cells within a mask that are left out: at pinches of the boundary, and in components that the mask does not have."""
+"""Remove cells within a mask: at pinches of the boundary, and in components that the mask does not have."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from tetopt.geometry.topology import compact, components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-# of the largest connected component of cells in one of voxels: smaller ones beside it are dropped
+# of the largest component of cells within a component of voxels: smaller ones beside it are dropped
 DROPPED_FRACTION = 0.1
 
 
 class Carved(NamedTuple):
-    """Which cells stay."""
+    """The cells that stay."""
 
     is_kept: NDArray[np.bool_]  # (M,)
-    n_dropped: int  # connected components left out
+    n_dropped: int  # dropped connected components
 
 
 def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = False) -> Carved:
-    """Cells of a mesh within a region that stay, so that its boundary is a manifold, its components those of the mask.
+    """Select the cells of a mesh to keep, so that its boundary is a manifold and its components are the mask's.
 
-    Cells at pinches of the boundary go (`manifold_part`). Of the connected components of cells within one of voxels,
-    linked by faces, the largest stays, and those of a tenth of its volume or more; with `keeps_components` all do.
+    Cells at pinches of the boundary are dropped (`manifold_part`). Within each face-connected component of voxels, the
+    largest connected component of cells stays, and those of a tenth of its volume or more; with `keeps_components`
+    all stay.
     """
     size = volumes(mesh.points, mesh.cells)
     is_kept = manifold_part(_welded(mesh), size)
@@ -49,7 +50,7 @@ def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = Fa
 
 
 def _welded(mesh: Mesh) -> NDArray[np.int64]:
-    """The cells with one number for all nodes in one place: parts of a boundary may touch there without sharing one."""
+    """The cells with one number for coincident nodes, where parts of a boundary may touch without sharing a node."""
     order = np.lexsort(mesh.points.T)
     is_new = np.append(True, (mesh.points[order[1:]] != mesh.points[order[:-1]]).any(axis=1))
     first = np.empty(len(order), dtype=np.int64)
@@ -58,7 +59,7 @@ def _welded(mesh: Mesh) -> NDArray[np.int64]:
 
 
 def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
-    """The cells of a mesh that stay, (M,), without the nodes that no cell uses then."""
+    """The mesh of the cells that stay, (M,), without unused nodes."""
     if is_kept.all():
         return mesh
     used, cells = compact(mesh.cells[is_kept], len(mesh.points))
@@ -74,12 +75,12 @@ def _home(
     mesh: Mesh, chosen: NDArray[np.int64], number: NDArray[np.int64], size: NDArray[np.float64], image: Image,
     region: Region,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """The component of voxels, from 1, that most of each component of the chosen cells lies in, (C,); 0 for none."""
+    """The component of voxels, from 1, that contains most of each component of the chosen cells, (C,); 0 for none."""
     of_voxel, n_homes = scipy.ndimage.label(region.inside)
     index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
     at = of_voxel[tuple(np.clip(index, 0, np.array(image.shape) - 1).T)].astype(np.int64)
     fractions = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
-    fractions = fractions[:, 1:]  # a component that lies outside in part has its home inside
+    fractions = fractions[:, 1:]  # a component that lies partly outside has its home inside
     home = np.zeros(fractions.shape[0], dtype=np.int64)
     has_home = np.diff(fractions.indptr) > 0
     home[has_home] = np.asarray(fractions.argmax(axis=1)).ravel()[has_home] + 1

@@ -1,7 +1,7 @@
-"""A mesh of an image's box cut off at the surface of a mask's region.
+"""Clip a mesh of an image's box at the surface of a mask's region.
 
-Nodes near the surface are put on it, then the edges that still cross it are split there, so that every cell lies on
-one side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
+Nodes near the surface move onto it; then edges that still cross it are split there, so that every cell lies on one
+side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 
-SNAP_FRACTION = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
-TOUCH_FRACTION = 0.15  # of an edge: a node as near to the surface counts as on it, even if it cannot be put there
-LEAST_FULLNESS = 0.2  # see `_fullness`: a cell has to keep as much when nodes are put on the surface
+SNAP_FRACTION = 0.3  # of an edge: a node this near to the surface along it moves onto the surface
+TOUCH_FRACTION = 0.15  # of an edge: a node this near to the surface counts as on it, even if it cannot move there
+LEAST_FULLNESS = 0.2  # least `_fullness` of a cell when nodes move onto the surface
 LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
 SNAP_STEPS = 8  # Newton steps towards the surface
-BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to a millionth of its length
+BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to 1e-6 of its length
 
 
 def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
-    """The part of a mesh of the image's box that lies within the region, nodes on its surface, all cells whole.
+    """The part of a mesh of the image's box within the region, with nodes on its surface and whole cells.
 
     Raises
     ------
     InputError
-        No cell is left: the region is thinner than the cells.
+        No cell remains: the region is thinner than the cells.
     """
     index = image.to_index(mesh.points)
     level = levels(region.level, index)
     level[np.abs(level) < ON_SURFACE_VOXELS] = 0.0
-    # The surface changes only the cells that share a node with one that it crosses: of a large mesh they are few.
+    # The surface changes only cells that share a node with one that it crosses, which are few in a large mesh.
     is_inside, is_outside = _sides(level, mesh.cells)
     is_touched = np.zeros(len(level), dtype=bool)
     is_touched[mesh.cells[is_inside & is_outside]] = True
@@ -49,13 +49,13 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     is_flat = ~(is_inside | is_outside)
     is_inside[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1)) < 0.0
     if not is_inside.any():
-        raise InputError("mask: it is thinner than the cells, none is left inside; ask for more nodes")
+        raise InputError("mask: it is thinner than the cells, so none is left inside; increase the number of nodes")
     used, kept = compact(cells[is_inside], len(index))
     return Mesh(image.to_world(index[used]), kept)
 
 
 def _sides(level: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cells have a node inside, and which have one outside, (M,) each."""
+    """Masks of the cells with a node inside, and of those with a node outside, (M,) each."""
     of_cells = level[cells]
     return np.asarray(of_cells.min(axis=1) < 0.0), np.asarray(of_cells.max(axis=1) > 0.0)
 
@@ -64,12 +64,12 @@ def lattice_within(
     image: Image, region: Region | None, kind: str | None = None, *, nodes: int | None = None,
     spacing: float | None = None,
 ) -> Mesh:  # fmt: skip
-    """`tetopt.lattice_mesh` of the image's box, cut off at the region's surface, with about `nodes` nodes in it.
+    """`tetopt.lattice_mesh` of the image's box, clipped at the region's surface, with about `nodes` nodes.
 
     Raises
     ------
     InputError
-        As `tetopt.lattice_mesh` and `clipped`.
+        As for `tetopt.lattice_mesh` and `clipped`.
     """
     if region is None or nodes is None:
         mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
@@ -85,7 +85,7 @@ def lattice_within(
 def _snapped(
     index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes that are near to the surface along an edge put on it, unless that flattens a cell."""
+    """Move nodes that are near to the surface along an edge onto it, unless that flattens a cell."""
     edge = edge_ends(cells).reshape(-1, 2)
     a, b = level[edge].T
     crosses = a * b < 0.0
@@ -95,7 +95,7 @@ def _snapped(
     is_close[edge[part > 1.0 - SNAP_FRACTION, 1]] = True
     close = np.flatnonzero(is_close)
     there, is_there = onto_surface(index[close], image, region)
-    # Where a node cannot get there on a short way, its edges are split instead.
+    # The edges of a node that cannot get there on a short way are split instead.
     length = np.full(len(level), np.inf)
     np.minimum.at(length, edge.ravel(), np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2))
     way = np.zeros(len(level))
@@ -112,7 +112,7 @@ def _snapped(
             break
         moved[back], way[back] = index[back], 0.0
     level = np.where(way > 0.0, 0.0, level)
-    # What is left very near to a crossing counts as on the surface; it gets there as soon as it moves.
+    # A node that remains very near to a crossing counts as on the surface; it gets there as soon as it moves.
     edge = edge[level[edge].prod(axis=1) < 0.0]
     a, b = np.abs(level[edge].T)
     level[edge[a < TOUCH_FRACTION * (a + b), 0]] = 0.0
@@ -121,7 +121,7 @@ def _snapped(
 
 
 def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Volume over that of the regular cell with the same sum of squared edges, (M,): 1 to 0, below 0 if inverted."""
+    """Volume relative to the regular cell with the same sum of squared edges, (M,): 0 to 1, negative if inverted."""
     n = points.shape[1]
     regular = 2.0**0.5 / 12.0 / 6.0**1.5 if n == 3 else 3.0**0.5 / 4.0 / 3.0
     return volumes(points, cells) / (regular * squared_edges(points, cells).sum(axis=1) ** (0.5 * n))
@@ -130,7 +130,7 @@ def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[
 def onto_surface(
     index: NDArray[np.float64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Points (K, n) moved to the surface, nearly the shortest way in mm, and whether they got there, (K,).
+    """Move points (K, n) to the surface, nearly the shortest way in mm; also return a mask of those that arrive, (K,).
 
     Those on the box's faces stay on them.
     """
@@ -161,10 +161,10 @@ def _cut(
     index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], near: NDArray[np.int64],
     region: Region,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
-    """Nodes, their levels and cells after every edge that crosses the surface is split there; `near` numbers its cells.
+    """Split every edge that crosses the surface there; `near` numbers the cells. Return nodes, their levels and cells.
 
-    In each round every cell is split at the first of its crossing edges, in an order that is the same for all cells,
-    so that two of them always cut the facet between them alike.
+    Each round splits every cell at the first of its crossing edges, in an order that is the same for all cells, so that
+    two cells always cut the facet between them alike.
     """
     n_nodes = len(index)
     ends = edge_ends(cells[near])
@@ -191,7 +191,7 @@ def _cut(
 
 
 def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
-    """Where the surface crosses the edges from a to b, (K, n), by bisection."""
+    """Places where the surface crosses the edges from a to b, (K, n), by bisection."""
     low, high = np.zeros(len(a)), np.ones(len(a))
     sign = np.sign(levels(region.level, a))
     for _ in range(BISECTION_ROUNDS):

@@ -1,8 +1,8 @@
-"""Sizes of cells by label: so many cells across where a label is thin, or a length, or a part of its thickness.
+"""Sizes of cells by label: a number of cells across where a label is thin, a length, or a fraction of its thickness.
 
-Targets of `tetopt.start.sizes` by place, from the local thickness of labels (`tetopt.contents.thickness`), as of
-proximity sizing in Ansys, of narrow regions in COMSOL, and of the slopes of SimNIBS' charm (Puonti et al. 2020,
-NeuroImage 219, 117044).
+The targets of `tetopt.start.sizes` by place follow from the local thickness of labels (`tetopt.contents.thickness`), as
+in proximity sizing in Ansys, narrow regions in COMSOL, and the slopes of SimNIBS' charm (Puonti et al. 2020, NeuroImage
+219, 117044).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from tetopt.image import Image
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Sizes
 
-EVERY_LABEL = "*"  # all labels that have no size of their own
+EVERY_LABEL = "*"  # all labels without their own size
 SIZE_FORM = re.compile(r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?")
-DEFAULT_SIZED_NODES = 5000  # of the uniform mesh whose edges are the largest where neither nodes nor lengths are given
-BELOW_FRACTION = 0.98  # of the cells asked for: where fewer lie across, a place counts as below
-SCALE_STEPS = 12  # of bisection for the factor by which a number of nodes makes sizes larger: to a thousandth
-LARGEST_SCALE = 64.0  # of that factor
+DEFAULT_SIZED_NODES = 5000  # of the uniform mesh that sets the largest targets if no nodes or lengths are given
+BELOW_FRACTION = 0.98  # of the requested cells: a place with fewer across counts as below
+SCALE_STEPS = 12  # bisection steps for the factor that enlarges sizes to fit a number of nodes: to 1e-3
+LARGEST_SCALE = 64.0  # upper limit of that factor
 MOST_ACROSS = 20.0  # cells across a label
 
 
@@ -36,9 +36,9 @@ class LabelSize(NamedTuple):
     Parameters
     ----------
     length : float
-        mm; with `is_slope` mm by mm of thickness.
+        mm; with `is_slope`, mm per mm of thickness.
     is_slope : bool
-        Whether the thickness counts.
+        True if the size is proportional to the thickness.
     least, most : float
         Bounds of the size, mm.
 
@@ -54,7 +54,7 @@ class LabelSize(NamedTuple):
     most: float = np.inf
 
     def at(self, thickness: NDArray) -> NDArray[np.float64]:
-        """Return the size of cells where the label is so thick.
+        """Return the size of cells at a given thickness of the label.
 
         Parameters
         ----------
@@ -64,7 +64,7 @@ class LabelSize(NamedTuple):
         Returns
         -------
         float64 array
-            mm, of the same shape.
+            Sizes, mm, of the same shape.
 
         Examples
         --------
@@ -76,20 +76,20 @@ class LabelSize(NamedTuple):
 
 
 class LabelLayers(NamedTuple):
-    """How thick a label is, and what sizes of cells it gets.
+    """Thickness of a label, and the sizes of its cells.
 
     Parameters
     ----------
     label : int
-        Its number.
+        Number of the label.
     thickness : tuple of float
-        5, 50 and 95 % of its voxels are no thicker, mm; what is thicker than sizes depend on counts as so thick.
+        Percentiles 5, 50 and 95 over its voxels, mm; clipped where sizes no longer depend on it.
     edge : float
-        The median of its targets, mm.
+        Median of its targets, mm.
     cells_across : float
-        The median of thickness over target.
+        Median of thickness over target.
     below : float
-        The fraction of its voxels across which there are fewer cells than asked for; 0 if no number is, as for label 0.
+        Fraction of its voxels with fewer cells across than requested; 0 if no number is, as for label 0.
 
     Examples
     --------
@@ -108,16 +108,16 @@ class LabelLayers(NamedTuple):
 
 
 class SizesByLabel(NamedTuple):
-    """What `sizes_by_label` returns.
+    """Result of `sizes_by_label`.
 
     Parameters
     ----------
     sizes : Sizes
-        With a field of targets.
+        Sizes with a field of targets.
     nodes : int
-        How many nodes the sizes that were asked for take, about.
+        Approximate number of nodes that the requested sizes take.
     scale : float
-        By how much they are larger than asked for, as fewer nodes are to be had; 1 if they are not.
+        Factor by which they are larger than requested to meet a lower number of nodes; else 1.
     layers : list of LabelLayers
         A row for each label, the thinnest first, label 0 last.
 
@@ -137,22 +137,22 @@ class SizesByLabel(NamedTuple):
 
 
 def parse_label_sizes(text: str) -> dict[int | str, LabelSize]:
-    """Sizes by label, or by labels' names, as written on a command line, `*` for all others.
+    """Parse sizes by label, or by labels' names, as written on a command line; `*` stands for all others.
 
     Parameters
     ----------
     text : str
-        "NAME=SIZE, ...", a size being mm, or a part of the thickness t, with bounds in mm if need be.
+        "NAME=SIZE, ...", where a size is in mm, or a fraction of the thickness t with optional bounds in mm.
 
     Returns
     -------
     dict of int or str to LabelSize
-        In that order.
+        The sizes, in that order.
 
     Raises
     ------
     InputError
-        The text is something else, or names a label twice.
+        The text has another form, or names a label twice.
 
     Examples
     --------
@@ -173,12 +173,12 @@ def parse_label_sizes(text: str) -> dict[int | str, LabelSize]:
 
 
 def parse_label_size(text: str | float) -> LabelSize:
-    """The size that a text says: "1.5", "0.6t", "0.6t[1:10]", or a number.
+    """Parse a size: "1.5", "0.6t", "0.6t[1:10]", or a number.
 
     Raises
     ------
     InputError
-        It says none, or one that is not above 0.
+        The text has another form, or the size is not above 0.
     """
     match = SIZE_FORM.fullmatch(str(text).replace(" ", ""))
     try:
@@ -189,38 +189,38 @@ def parse_label_size(text: str | float) -> LabelSize:
         )
     except ValueError:
         raise InputError(
-            f'label_size: expected mm, or a part of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
+            f'label_size: expected mm, or a fraction of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
         ) from None
     if not (0.0 < size.length < np.inf and 0.0 <= size.least <= size.most and size.most > 0.0):
-        raise InputError(f'label_size: expected lengths above 0 mm, the bounds rising, got "{text}"')
+        raise InputError(f'label_size: expected lengths above 0 mm with increasing bounds, got "{text}"')
     return size
 
 
 def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = None) -> SizesByLabel | None:
     """Targets by place from `cells_across` and `by_label` of sizes; None without them.
 
-    A place gets the smallest of: its label's size; its local thickness over `cells_across`, but in label 0, which is no
-    tissue; `field` and `edge_size`. It is never below `smallest`. Without `edge_size`, places that are not thin get no
-    target if `nodes` are given, and the usual edge of a uniform mesh of 5,000 nodes else.
+    A place gets the smallest of its label's size; its local thickness over `cells_across`, except in label 0, which is
+    not a tissue; `field`; and `edge_size`, but never less than `smallest`. Without `edge_size`, places that are not
+    thin get no target if `nodes` is given, and otherwise the usual edge of a uniform mesh of 5,000 nodes.
 
     Parameters
     ----------
     sizes : Sizes
-        What is asked for.
+        The requested sizes.
     image : Image or Content
-        With labels.
+        A content with labels.
     nodes : int, optional
-        How many nodes, corners of cells, there are: if sizes take more, all become larger by one factor.
+        Available number of nodes (corners of cells): if sizes take more, a common factor enlarges all.
 
     Returns
     -------
     SizesByLabel
-        The sizes with a field for them, and what each label gets.
+        The sizes as a field, and the sizes of each label.
 
     Raises
     ------
     InputError
-        No labels, none of a number that has a size, a value out of range.
+        No labels, a size for a label that does not exist, or a value out of range.
 
     Examples
     --------
@@ -264,10 +264,10 @@ def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = Non
 
 
 def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
-    """The size of each label that has one, by its row; InputError for labels that there are not, and wrong values."""
+    """The size of each label that has one, by row; raise InputError for unknown labels and invalid values."""
     members = content.memberships
     if members is None:
-        raise InputError("sizes: cells_across and by_label take labels whose interfaces are smooth; give labels")
+        raise InputError("sizes: cells_across and by_label require labels with smooth interfaces; give labels")
     if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
         raise InputError(f"cells_across: expected above 0 to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
     by_label = {
@@ -278,13 +278,13 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     rows = {int(label): row for row, label in enumerate(members.labels)}
     if missing := [label for label in by_label if label not in rows]:
         names = ", ".join(map(str, rows))
-        raise InputError(f"label_size: no voxel that is meshed has label {missing[0]}; there are {names}")
+        raise InputError(f"label_size: no meshed voxel has label {missing[0]}; the labels are {names}")
     rules = {rows[int(label)]: size for label, size in by_label.items()}
     return rules if rest is None else {row: rules.get(row, rest) for row in rows.values()}
 
 
 def _largest(sizes: Sizes, content: Content, nodes: int | None) -> tuple[float, bool]:
-    """The largest target, mm, and whether there is one everywhere."""
+    """The largest target, mm, and True if every place has one."""
     if sizes.edge_size is not None and sizes.edge_size < np.inf:
         return sizes.edge_size, True
     n = content.image.ndim
@@ -293,7 +293,7 @@ def _largest(sizes: Sizes, content: Content, nodes: int | None) -> tuple[float, 
 
 
 def _thickness(sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float) -> NDArray[np.float32]:
-    """The local thickness by voxel, mm, up to where sizes depend on it no more."""
+    """The local thickness by voxel, mm, clipped where sizes no longer depend on it."""
     assert content.memberships is not None
     spacing = content.image.spacing
     slopes = [min(rule.most, largest) / rule.length for rule in rules.values() if rule.is_slope]
@@ -305,7 +305,7 @@ def _thickness(sizes: Sizes, content: Content, rules: dict[int, LabelSize], larg
 def _targets(
     sizes: Sizes, content: Content, rules: dict[int, LabelSize], thickness: NDArray[np.float32], largest: float
 ) -> NDArray[np.float64]:
-    """The smallest target of those asked for at each voxel, mm."""
+    """The smallest requested target at each voxel, mm."""
     assert content.memberships is not None
     target = np.minimum(sizes.on_voxels(content.image), largest).astype(np.float64)
     if sizes.cells_across is not None:
@@ -319,7 +319,7 @@ def _targets(
 
 
 def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray) -> list[LabelLayers]:
-    """What each label gets, the thinnest first, the background last."""
+    """The thickness and sizes of each label, the thinnest first, the background last."""
     assert content.memberships is not None
     rows = []
     for row, label in enumerate(content.memberships.labels):

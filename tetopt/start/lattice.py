@@ -4,10 +4,10 @@ The paper starts from "a uniform mesh of regular elements throughout the domain"
 directly. Each lattice divides the box, index -0.5 to shape - 0.5, into equal blocks as near to cubes (squares) as
 the box allows:
 
-- ``criss-cross`` (2-D): every square cut into four triangles by its centre; the meshes of Fig. 2(a) and 3(a, c).
-- ``five-tet`` (3-D): every cube cut into five tetrahedra, mirrored between neighbours; the mesh of Fig. 3(e).
+- ``criss-cross`` (2-D): its centre divides every square into four triangles; the meshes of Fig. 2(a) and 3(a, c).
+- ``five-tet`` (3-D): every cube consists of five tetrahedra, mirrored between neighbours; the mesh of Fig. 3(e).
 - ``bcc`` (3-D): body-centred cubic, four congruent tetrahedra around each edge between neighbouring cube centres
-  (dihedral angles 60 and 90 degrees, rho 0.3162); on the box's faces, pyramids under the cube centres cut in two.
+  (dihedral angles 60 and 90 degrees, rho 0.3162); on the box's faces, halves of pyramids below the cube centres.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tetopt.system.budget import check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
 KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first
-LATTICE_NODE_BYTES = 800.0  # six cells of four node numbers, and as they are put together three times that
+LATTICE_NODE_BYTES = 800.0  # six cells of four node numbers, and three times that during assembly
 MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
 
@@ -39,35 +39,35 @@ def lattice_mesh(
     spacing: float | None = None,
     blocks: tuple[int, ...] | None = None,
 ) -> Mesh:
-    """A uniform mesh of the image's box.
+    """Make a uniform mesh of the image's box.
 
     Parameters
     ----------
     image : Image
-        Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly.
+        The mesh covers its box, index -0.5 to shape - 0.5 along each axis, exactly.
     kind : str, optional
         "criss-cross" in 2-D; "bcc" (default) or "five-tet" in 3-D.
     nodes : int, optional
-        Number of nodes to come near to. The lattice whose count is nearest, among those with the most cubic blocks.
+        Desired number of nodes. The lattice with the nearest count is used, among those with the most cubic blocks.
     spacing : float, optional
-        Edge length of a block, mm; the nearest that divides the box is taken.
+        Edge length of a block, mm, rounded to the nearest that divides the box.
     blocks : tuple of n int, optional
-        Number of blocks along each axis. Exactly one of `nodes`, `spacing` and `blocks` is given.
+        Number of blocks along each axis. Give exactly one of `nodes`, `spacing` and `blocks`.
 
     Returns
     -------
     Mesh
-        Conforming, positively oriented, every node used, no flat cell, its volume that of the box.
+        A conforming, positively oriented mesh without unused nodes or flat cells, with the volume of the box.
 
     Raises
     ------
     InputError
-        Unknown kind for the dimension, not exactly one size, or a size that no lattice has.
+        Unknown kind for the dimension, not exactly one size, or a size out of range.
 
     See Also
     --------
-    octree_mesh : A graded mesh.
-    mesh_image : Begins with one, in its mode "uniform".
+    octree_mesh : Make a graded mesh.
+    mesh_image : Start from a lattice in its mode "uniform".
 
     Examples
     --------
@@ -102,13 +102,13 @@ def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[
     except TypeError:
         blocks = ()
     if len(blocks) != n or min(blocks) < 1:
-        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {counts!r}")
+        raise InputError(f"lattice: expected {n} whole numbers >= 1 for blocks, got {counts!r}")
     if _node_count(kind, blocks) > MAX_NODES:
         raise InputError(
-            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; ask for fewer"
+            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; use fewer blocks"
         )
     n_nodes = _node_count(kind, blocks)
-    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "ask for fewer")
+    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "use fewer nodes")
     return blocks
 
 
@@ -119,19 +119,19 @@ def _node_count(kind: str, blocks: tuple[int, ...]) -> int:
 
 def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[int, ...]:
     if not (np.isfinite(spacing) and spacing > 1e-300):
-        raise InputError(f"lattice: spacing must be a length above 0 mm, got {spacing}")
+        raise InputError(f"lattice: expected a spacing above 0 mm, got {spacing}")
     return tuple(max(1, round(min(length / spacing, MAX_NODES))) for length in lengths)
 
 
 def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
-    """Nearly cubic blocks whose node count is within 3 % of `nodes`, the most cubic; else those with the nearest.
+    """The most cubic blocks whose node count is within 3 % of `nodes`; else those with the nearest count.
 
-    On a brain's box every number from 3000 on is met within 3 %; smaller ones are missed by up to a tenth, since only
-    blocks far from cubes would meet them.
+    On a brain's box every number from 3000 is met within 3 %; smaller ones are missed by up to 10 %, since only blocks
+    far from cubes would meet them.
     """
     fewest = _node_count(kind, (1,) * len(lengths))
     if not fewest <= nodes <= MAX_NODES:
-        raise InputError(f"lattice: nodes must lie between {fewest} and {MAX_NODES} for {kind}, got {nodes}")
+        raise InputError(f"lattice: expected {fewest} to {MAX_NODES} nodes for {kind}, got {nodes}")
     per_block = 1 if kind == "five-tet" else 2
     edge = (np.prod(lengths) * per_block / nodes) ** (1.0 / len(lengths))
     candidates: set[tuple[int, ...]] = set()
@@ -148,7 +148,7 @@ def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int
 
 
 def _corner_number(blocks: tuple[int, ...]) -> NDArray[np.int64]:
-    """Node numbers of the blocks' corners, of shape blocks + 1."""
+    """Node numbers of the blocks' corners, an array of shape blocks + 1."""
     shape = tuple(b + 1 for b in blocks)
     return np.arange(np.prod(shape)).reshape(shape)
 
@@ -174,7 +174,7 @@ def _criss_cross(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[
 
 
 # The five tetrahedra of a cube whose corner (x, y, z) has local number 4x + 2y + z: one of the two regular ones in
-# the middle, on corners of even or odd parity, and the four corners that it leaves.
+# the middle, on corners of even or odd parity, and the four remaining corners.
 _FIVE_EVEN = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]])
 _FIVE_ODD = np.array([[1, 2, 4, 7], [0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7]])
 
@@ -200,7 +200,7 @@ def _bcc(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64
 
 
 def _bcc_across(corner: NDArray[np.int64], centre: NDArray[np.int64], axis: int) -> list[NDArray[np.int64]]:
-    """Cells that meet the block faces normal to `axis`: between two centres inside, half pyramids on the box."""
+    """Cells at the block faces normal to `axis`: between two centres inside, half pyramids on the box."""
     corner = np.moveaxis(corner, axis, 0)
     centre = np.moveaxis(centre, axis, 0)
     loop = [corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]]
@@ -212,7 +212,7 @@ def _bcc_across(corner: NDArray[np.int64], centre: NDArray[np.int64], axis: int)
 
 
 def _half_pyramids(square: list[NDArray[np.int64]], apex: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """The pyramids over the box's squares, each cut in two; the diagonals alternate, so the pattern is even."""
+    """The pyramids over the box's squares, cut in two along alternating diagonals."""
     a, b, c, d = square
     is_odd = np.indices(apex.shape).sum(axis=0) % 2 == 1
     first = np.where(is_odd[..., None], np.stack([b, c, d], axis=-1), np.stack([a, b, c], axis=-1))

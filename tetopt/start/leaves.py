@@ -1,9 +1,9 @@
 """Nodes and cells of an octree's leaves (in 2-D a quadtree's): corners and centres, joined by templates.
 
-Neighbouring leaves differ by one division at most, also across edges and corners: each edge of a leaf has a node in its
-middle or none, each face one in its centre or none, and both sides of a face divide it alike. The cells of a leaf share
-its centre. In 2-D their other nodes are the ends of an edge, or of a half of one with a node in its middle. In 3-D they
-depend on what lies across a face:
+Neighbouring leaves differ by at most one division, also across edges and corners: each edge of a leaf has at most a
+node in its middle, each face at most one in its centre, and both sides of a face divide it alike. The cells of a leaf
+share its centre. In 2-D their other nodes are the ends of an edge, or of half an edge with a node in its middle. In 3-D
+they depend on the neighbour across a face:
 
 - A leaf of the same size: its centre, and two neighbouring nodes around the face. Without nodes in the middle of edges
   these are the four cells of a body-centred lattice.
@@ -11,7 +11,7 @@ depend on what lies across a face:
 - A larger leaf, the outside of the box, or a leaf of the same size across a face with nodes in the middle of opposite
   edges: a triangle of the face.
 
-Where blocks are cubes the cells are Delaunay, and no dihedral angle is below 30 degrees.
+If blocks are cubes, the cells are Delaunay and no dihedral angle is below 30 degrees.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import oriented
 
-# Around a square, in halves of its edge: corners, and between them the middles of its edges.
+# Around a square, in halves of its edge: corners, alternating with the middles of its edges.
 FACE_RING = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
-LEAVES_AT_A_TIME = 2**16  # whose cells are put together at a time
+LEAVES_AT_A_TIME = 2**16  # leaves whose cells are assembled at a time
 
 
 class LeafNodes(NamedTuple):
-    """Corners and centres of leaves, each once, in lexicographic order of their places; made by `leaf_nodes`.
+    """Distinct corners and centres of leaves in lexicographic order of their places; made by `leaf_nodes`.
 
-    A place is in halves of the smallest leaves, its code one number for all its coordinates.
+    Places are in halves of the smallest leaves; a code combines the coordinates of a place into one number.
     """
 
     codes: NDArray[np.int64]  # (N,) sorted
-    steps: NDArray[np.int64]  # (n,) in a code, of one along each axis
-    depth: int  # of the smallest leaves
+    steps: NDArray[np.int64]  # (n,) change of the code by one step along each axis
+    depth: int  # depth of the smallest leaves
 
     def places(self) -> NDArray[np.float64]:
-        """Their places, (N, n), in units of an undivided block."""
+        """Places of the nodes, (N, n), in units of an undivided block."""
         along_axes, rest = [], self.codes
         for step in self.steps:
             along, rest = np.divmod(rest, step)
@@ -48,7 +48,7 @@ class LeafNodes(NamedTuple):
         return np.stack(along_axes, axis=1) / 2.0 ** (self.depth + 1)
 
     def at(self, codes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The nodes of these codes, -1 where there is none."""
+        """The nodes with these codes, -1 where there is none."""
         node = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[node] == codes, node, -1)
 
@@ -66,7 +66,7 @@ def leaves_by_depth(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) ->
 def leaf_nodes(
     divided: list[NDArray[np.bool_]], roots: tuple[int, ...], regions: Sequence[NDArray[np.bool_]] = ()
 ) -> LeafNodes:
-    """Corners and centres of the leaves; with regions, by depth, not those of the leaves outside."""
+    """Corners and centres of the leaves; with regions, given by depth, leaves outside are skipped."""
     n, depth = len(roots), len(divided)
     corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
     of_leaf = np.vstack([corner, np.ones((1, n), dtype=np.int64)])  # in halves of a leaf
@@ -78,7 +78,7 @@ def leaf_nodes(
         codes.append(((2 * inside @ steps)[:, None] + of_leaf @ steps << (depth - d)).ravel())
     ordered = np.concatenate(codes)
     ordered.sort()
-    # `np.unique` goes by hashes: it takes twenty times as long.
+    # `np.unique` uses hashes, which takes twenty times as long.
     return LeafNodes(ordered[np.append(True, ordered[1:] != ordered[:-1])], steps, depth)
 
 
@@ -108,7 +108,7 @@ def _cells_in_plane(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> 
 
 
 def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
-    """The tetrahedra of leaves of one depth, face by face; those between two leaves by the first of these."""
+    """The tetrahedra of leaves of one depth, face by face; the first of two leaves lists those between them."""
     first, shift = 2 * leaves @ nodes.steps, nodes.depth - depth
     centre = nodes.at(first + nodes.steps.sum() << shift)
     for axis in range(3):
@@ -117,10 +117,10 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
             face = first + (1 + side) * step
             ring = np.stack([nodes.at(face + more << shift) for more in FACE_RING @ along], axis=1)
             middle = nodes.at(face + along.sum() << shift)
-            # Beyond the box that is the code of a place with odd and even coordinates, where no node is.
+            # Beyond the box this is the code of a place with odd and even coordinates, which has no node.
             across = nodes.at(first + nodes.steps.sum() + 2 * side * step << shift)
-            # Two nodes in the middle of opposite edges and the two centres are a square, cut either way: by the face's
-            # diagonal there are more cells, and E_D is 1 % less.
+            # The middles of opposite edges and the two centres form a square with two possible diagonals: the one in
+            # the face gives more cells, and 1 % less E_D.
             is_square = (ring[:, [1, 5]].min(axis=1) >= 0) | (ring[:, [3, 7]].min(axis=1) >= 0)
             is_fine, is_even = middle >= 0, (middle < 0) & (across >= 0) & ~is_square
             yield _around(ring[is_fine], np.stack([centre, middle], axis=1)[is_fine])
@@ -133,7 +133,7 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
 def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     """Cells between the centres of two leaves, (K, 2), that share a face.
 
-    Where its corner lies between two nodes in the middle of edges, the three are cut off, as Delaunay has it.
+    Where a corner of the face lies between two mid-edge nodes, these three are cut off, as in Delaunay cells.
     """
     left = ring.copy()
     for k in (0, 2, 4, 6):
@@ -145,7 +145,7 @@ def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArr
 
 
 def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells of the tips, (K, t), and each two neighbours of a ring, (K, 8), -1 where it has no node."""
+    """Cells of the tips, (K, t), and any two neighbours in a ring, (K, 8), with -1 for missing nodes."""
     cells = []
     for k in range(8):
         first, second, third = ring[:, k], ring[:, (k + 1) % 8], ring[:, (k + 2) % 8]
@@ -156,9 +156,9 @@ def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int6
 def _on_squares(
     ring: NDArray[np.int64], centre: NDArray[np.int64], is_odd: NDArray[np.bool_], chosen: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.int64]]:
-    """Cells of the centre and a triangle, of the chosen squares.
+    """Cells of the centre and the triangles of the chosen squares.
 
-    Diagonals of plain squares join the corners whose places have an even sum: on a larger leaf's face these are those
+    Diagonals of plain squares join the corners whose coordinates have an even sum: on a larger leaf's face they start
     from its centre, and on the box's sides they alternate.
     """
     has_middle = ring[:, 1::2] >= 0
@@ -172,10 +172,10 @@ def _on_squares(
 
 
 def _triangles(mask: int) -> Iterator[tuple[int, int, int]]:
-    """Triangles of a square's ring, by which of its edges have a node in their middle.
+    """Triangles of a square's ring; `mask` gives the edges with a node in the middle.
 
-    The shortest diagonals first, which cut off corners rather than middles, wide angles rather than sharp ones: so none
-    is below 26 degrees.
+    The shortest diagonals come first, which cut off corners rather than middles and wide angles rather than sharp ones,
+    so that no angle is below 26 degrees.
     """
     left = [k for k in range(8) if k % 2 == 0 or mask >> (k // 2) & 1]
     while len(left) > 2:

@@ -1,17 +1,17 @@
-"""Initial meshes with nodes where the image has content: an octree of the box (in 2-D a quadtree).
+"""Initial meshes with nodes where the image has detail: an octree of the box (in 2-D a quadtree).
 
-The box is divided into a few equal blocks as near to cubes as it allows, and blocks into 2^n again and again, first
-those that hold the largest sum of squared deviations from their mean: that is the error E_D of a mesh with one value a
-block, so what is left is spread evenly over the leaves. Noise has no say: of each block's sum, what noise of the
-image's own strength would leave is taken off, so that a noisy but uniform region stays coarse. Neighbouring leaves
-differ by one division at most, also across edges and corners (2:1), and nodes are put at their corners and centres: a
-lattice of body-centred cubes that coarsens by steps of two, whose cells are templates (`tetopt.start.leaves`). Sizes
-(`tetopt.Sizes`) have the first say: blocks with longer edges than are allowed are divided, whatever they hold, and
-those whose halves would be too short are not. Blocks halve, so that a target for the usual edge lies between two of
-them: here and there one is divided, as many as give the target's number of nodes, and the exchanges of `optimize` make
-the rest of it.
+The box is divided into a few equal blocks as near to cubes as possible, and blocks are divided repeatedly into 2^n,
+those with the largest sum of squared deviations from their mean first. This sum is the error E_D of a mesh with one
+value per block, so the remaining error is spread evenly over the leaves. The part of each block's sum that noise of the
+image's strength would cause is subtracted, so that a noisy but uniform region stays coarse. Neighbouring leaves differ
+by at most one division, also across edges and corners (2:1), and nodes lie at their corners and centres: a lattice of
+body-centred cubes that coarsens in steps of two, whose cells are templates (`tetopt.start.leaves`). Sizes
+(`tetopt.Sizes`) take precedence: blocks with edges longer than allowed are divided regardless of their content, and
+those whose halves would be too short are not. Since blocks halve, a target for the usual edge lies between two block
+sizes: as many blocks are divided, here and there, as give the target's number of nodes, and the exchanges of `optimize`
+do the rest.
 
-The depth of a block is the number of divisions that it takes to get to it: 0 of the box's own blocks, the roots.
+The depth of a block is the number of divisions that lead to it: 0 for the undivided blocks, the roots.
 """
 
 from __future__ import annotations
@@ -42,69 +42,69 @@ from tetopt.start.sizes import (
 from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
 from tetopt.system.budget import check_memory
 
-# Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
+# Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks first.
 ROOT_FRACTIONS = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
-# By which part of the requested number of nodes an octree may miss it:
-BISECTION_MISS = 0.002  # so near, no other threshold is tried;
-TRIAL_MISS = 0.05  # so near, no other size of the undivided blocks is tried;
-LARGEST_MISS = 0.1  # further away it is an error,
-LARGEST_MISS_NODES = 40  # unless it is by so few nodes: about what one block more or less makes.
-BISECTION_STEPS = 60  # for the threshold, at most: it is then known to the last bit
-TARGET_MISS = 0.25  # by so much targets may exceed the requested nodes before they are enlarged, within a mask
-LIGHTER_TRIALS = 5  # of factors on targets that force too many nodes within a mask, by counts
+# Fractions of the requested number of nodes by which an octree may miss it:
+BISECTION_MISS = 0.002  # within this, no other threshold is tried;
+TRIAL_MISS = 0.05  # within this, no other size of the undivided blocks is tried;
+LARGEST_MISS = 0.1  # beyond this it is an error,
+LARGEST_MISS_NODES = 40  # unless the difference is so small: about the nodes of one block.
+BISECTION_STEPS = 60  # at most, for the threshold, which is then exact to the last bit
+TARGET_MISS = 0.25  # excess over the requested nodes at which targets within a mask are enlarged
+LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
-ALWAYS_ALLOWED_NODES = 5000  # even on images of fewer voxels
-LEAF_VOXELS = 2.0  # the least edge of a leaf where voxels are smallest; a quarter where they are largest
-SPREAD_OF_VARIANCE = 1e-3  # of the image's: what every voxel counts besides, so that any number of nodes is reached
-SPREAD_OF_NOISE = 0.03  # of the noise's variance, likewise: chance does not decide which noise is divided first
-NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not taken for content
-# Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
+ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
+LEAF_VOXELS = 2.0  # least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
+SPREAD_OF_VARIANCE = 1e-3  # of the image's variance: a base error of each voxel, to reach any number of nodes
+SPREAD_OF_NOISE = 0.03  # the same, of the noise's variance, so that chance does not decide which noise is divided first
+NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that do not count as content
+# Ratio to a target's blocks, to the n-th power, up to which larger ones stay whole, as a lattice seldom fits exactly.
 TARGET_SLACK = 0.25
-OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, put together and sorted: 600; as many to cut off a mask
-BLOCK_FIELD_BYTES = 8.0  # of the smallest blocks, for each field
-OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half of a field while it is halved
-# For the content's sake no more blocks are summed up, whose halves are the smallest leaves: 0.5 GB. Of 1024^3 voxels
-# there are never more; of 2048^3 leaves are 4 voxels at the least.
+OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, assembled and sorted: 600; as many for clipping
+BLOCK_FIELD_BYTES = 8.0  # per smallest block and field
+OTHER_FIELDS = 4  # in addition to the sums: targets, the errors of all depths, and half a field during halving
+# Limit for the summed blocks, whose halves are the smallest leaves that content can cause: 0.5 GB. 1024^3 voxels never
+# reach it; with 2048^3 voxels, leaves have at least 4 voxels.
 MOST_BLOCKS = 2**24
-LAYER_BLOCKS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
+LAYER_BLOCKS = 2**16  # processed at a time: half a megabyte per field, which fits into a processor's cache
 UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # the plastic number's powers -1 to -3
-SKIPPED_RATIO = 2.0  # of the requested nodes: with more leaves, nodes are not counted one by one
+SKIPPED_RATIO = 2.0  # of the requested nodes: if there are more leaves, nodes are not counted one by one
 NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
-TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
+TIE_SPREAD = 0.05  # of a block's error: decides between blocks that are alike
 
 
 def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
-    """A graded mesh of the image's box, or of the mask's region.
+    """Make a graded mesh of the image's box, or of the mask's region.
 
-    Blocks of voxels are divided where that lowers E_D most, and cut into cells that conform; see `tetopt.start.octree`.
+    Blocks of voxels are divided where that lowers E_D most, and filled with conforming cells (`tetopt.start.octree`).
 
     Parameters
     ----------
     image : Image or Content
-        Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly; or, with a mask, its region up to the
-        surface, on which nodes are put. A stored image is read box by box, once, and once for each of the sizes of
-        undivided blocks that are tried, up to eleven; the mesh is that of the same voxels in memory, to the last bit.
-        A `Content` that has their `statistics` is read once less.
+        The mesh covers its box, index -0.5 to shape - 0.5 along each axis, exactly; with a mask, it covers the mask's
+        region, with nodes on its surface. A stored image is read box by box: once, and once for each size of undivided
+        blocks that is tried, up to eleven (a `Content` with `statistics` saves one pass). The mesh is the same as for
+        the same voxels in memory, to the last bit.
     nodes : int
-        Number of nodes to come near to. The nearest octree has a few per cent more or less, of few a few dozen.
+        Desired number of nodes. The nearest octree differs by a few per cent, or by a few dozen of a small number.
     sizes : Sizes, optional
-        Targets and limits for the blocks' edges. Targets take voxels in memory.
+        Targets and limits for the blocks' edges. Targets require voxels in memory.
 
     Returns
     -------
     Mesh
-        Triangles or tetrahedra: conforming, positively oriented, every node used, the volume that of the box.
+        A conforming, positively oriented mesh without unused nodes, with the volume of the box.
 
     Raises
     ------
     InputError
-        More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the sizes need; or
-        intensities whose squares overflow; targets for a stored image.
+        More nodes than leaves of 2 voxels, or of the smallest size, can have; fewer nodes than the sizes need;
+        intensities whose squares overflow; or targets for a stored image.
 
     See Also
     --------
-    lattice_mesh : A uniform mesh.
-    optimize : Moves its nodes and exchanges them.
+    lattice_mesh : Make a uniform mesh.
+    optimize : Move and exchange the mesh's nodes.
 
     Examples
     --------
@@ -121,34 +121,34 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
     if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
-        if limits.target is None and enough <= prod(content.image.shape):  # the bound is low: the coarsest octree tells
+        if limits.target is None and enough <= prod(content.image.shape):  # count, as the bound is low
             enough = len(_octree_within(content, nodes, limits).points)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
-            f"ask for {np.ceil(enough):.0f}, or allow longer edges"
+            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need at least {least:.4g}; "
+            f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
     mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
-    # Exchanges take care of the rest.
+    # Exchanges correct the number within a mask or with targets.
     if is_near(count, nodes) or content.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
-        f"nearest octree found has {count}; ask for about as many, or for a uniform mesh"
+        f"nearest octree found has {count}; use about as many, or a uniform mesh"
     )
 
 
 class _BlockLimits(NamedTuple):
-    """Targets and limits for the blocks: for their edges, mm, and on how many of a size lie beside one another."""
+    """Targets and limits for the blocks' edges, mm, and the number of equal blocks beside one another."""
 
     largest: float
-    target: NDArray[np.float32] | None  # of the image's shape, by voxel: the usual edge of cells
-    smallest: float  # kept where not both can be
-    n_rings: int  # blocks of a divided block's size around it, in every direction
+    target: NDArray[np.float32] | None  # of the image's shape: usual edge of cells at each voxel
+    smallest: float  # takes precedence if both cannot be met
+    n_rings: int  # blocks of its size around a divided block, in every direction
 
 
 def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLimits:
-    """The limits that the number of nodes and the sizes set; InputError where they cannot be kept."""
+    """The limits from the number of nodes and the sizes; raise InputError if they cannot be met."""
     image = content.image
     n = image.ndim
     fewest = 2**n + 1
@@ -156,8 +156,8 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         shape = " x ".join(map(str, image.shape))
-        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
-    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "ask for fewer")
+        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; use fewer")
+    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "use fewer")
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
@@ -167,7 +167,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     target = None
     if sizes.has_target:
         check_in_memory(
-            image, "sizes: largest and field are for each voxel",
+            image, "sizes: largest and field require the voxels",
             "use smallest, longest, coarsest and gradation, or crop it",
         )  # fmt: skip
         target = _target(image, sizes)
@@ -175,7 +175,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
 
 
 def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
-    """The target by voxel, mm; InputError where a field has none."""
+    """The target by voxel, mm; raise InputError if a field has none."""
     target = sizes.on_voxels(image)
     if target.min() >= NO_BOUND_MM:
         raise InputError("field: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
@@ -183,14 +183,14 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
 
 
 def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
-    """How many nodes the targets take, 1.5 times those of equilateral cells; and the fraction of the mesh that has one.
+    """Number of nodes that targets take (1.5 times those of equilateral cells), and the fraction of the mesh with one.
 
-    Where there is one, there are 2^(n + 2) nodes or more, as few as any image is meshed with.
+    With any target the number is at least 2^(n + 2), the fewest nodes of any mesh.
 
     Raises
     ------
     InputError
-        Sizes out of range, or below voxels; a field beside the image.
+        Sizes out of range or below voxels, or a field outside the image.
     """
     content = plain(image)
     sizes = sizes.prepared(content.image.ndim)
@@ -206,43 +206,43 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
 
 
 def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
-    """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
+    """Lower bound of the nodes that the limits need: two for each block of the largest allowed size."""
     with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
         return float(2.0 * content.volume / np.float64(limits.largest) ** content.image.ndim)
 
 
 def _target_nodes(content: Content, limits: _BlockLimits) -> float:
-    """The nodes of equilateral cells of the targets, where there are any."""
+    """Number of nodes of equilateral cells with the targets' edges; 0 without targets."""
     if limits.target is None:
         return 0.0
     return equilateral_nodes(limits.target, content.image, content.inside)
 
 
 def _check_not_below_voxels(image: Image, nodes: float) -> None:
-    """InputError if there are more nodes than voxels."""
+    """Raise InputError if there are more nodes than voxels."""
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         raise InputError(
-            "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
+            "sizes: the requested edges are so short that cells are smaller than voxels; allow longer ones"
         )
 
 
 def is_near(count: int, nodes: int) -> bool:
-    """Whether a mesh of `count` nodes has about as many as were requested."""
+    """True if a mesh of `count` nodes has about as many as requested."""
     return abs(count - nodes) <= max(LARGEST_MISS * nodes, LARGEST_MISS_NODES)
 
 
 def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
-    """As `octree_mesh`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
+    """Like `octree_mesh`, but accept any number of nodes if the image or the sizes allow no nearer one."""
     content = plain(image)
     return _octree_within(content, nodes, _block_limits(content, nodes, sizes))
 
 
 def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
-    """The octree within the limits that has most nearly so many nodes, cut off at the mask's surface."""
+    """The octree within the limits with the nearest number of nodes, clipped at the mask's surface."""
     image, region = content.image, content.region
     if region is None:
         return _octree_of_box(content, nodes, limits)
-    # Nodes of the leaves that the region touches are, to a few per cent, as many as there are once they are cut off.
+    # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped mesh.
     limits = _lighter(content, nodes, limits)
     nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
@@ -264,9 +264,9 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 
 
 def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits:
-    """The limits with larger targets, where these alone divide the region's blocks into far more nodes than asked for.
+    """The limits with larger targets, if these alone divide the region's blocks into far more nodes than requested.
 
-    A block goes by its least target. Found by counts, as a mesh takes longer.
+    A block follows its least target. The factor is found by counts, as meshes take longer.
     """
     if limits.target is None:
         return limits
@@ -283,7 +283,7 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
 
 
 def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
-    """The octree of the whole box that has most nearly so many nodes."""
+    """The octree of the whole box with the nearest number of nodes."""
     image = content.image
     _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
@@ -295,19 +295,19 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 class _Blocks(NamedTuple):
     """The blocks of one depth."""
 
-    error: NDArray[np.float64]  # sums of squared deviations less the noise's, and the spread
+    error: NDArray[np.float64]  # sums of squared deviations minus the noise's, plus the spread
     is_too_large: NDArray[np.bool_]  # must be divided
-    is_in_region: NDArray[np.bool_] | None  # in part at least; without a mask all are
+    is_in_region: NDArray[np.bool_] | None  # at least in part; None without a mask
 
 
 def _blocks_by_depth(
     content: Content, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
 ) -> list[_Blocks]:  # fmt: skip
-    """The blocks of each depth, the coarsest first, with their errors and whether they exceed the limits."""
+    """The blocks of each depth, the coarsest first, with their errors and those that exceed the limits."""
     image = content.image
     edge = image.spacing * image.shape / np.array(roots)
     depth, n_by_content = _depths(edge, roots, image.spacing, limits)
-    # Errors say whether a block is divided: those of the smallest are not needed, but which of them a mask has.
+    # Errors decide on division: the smallest blocks need none, only whether a mask covers them.
     summed = depth if content.inside is not None else max(n_by_content - 1, 0)
     n_blocks, n_summed = (float(prod(roots)) * 2.0 ** (image.ndim * d) for d in (depth, summed))
     n_fields = len(channels.means) + 1 + (content.inside is not None) + OTHER_FIELDS
@@ -335,7 +335,7 @@ def _blocks_by_depth(
 
 
 def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.float64]:
-    """What each block counts: its sum of squared deviations less the noise's, and the spread; layer by layer."""
+    """Error of each block: its sum of squared deviations minus the noise's, plus the spread; layer by layer."""
     errors = np.empty(sums.second.shape)
     others = tuple(slice(0, size) for size in sums.second.shape[1:])
     step = max(LAYER_BLOCKS // prod(errors.shape[1:]), 1)
@@ -344,7 +344,7 @@ def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.fl
         voxels = sums.voxels(layers)
         count = voxels if sums.inside is None else sums.inside[layers]
         free = np.maximum(count - 1.0, 0.0)
-        # A chi-squared sum, and deviations of it.
+        # A chi-squared sum plus some of its standard deviations.
         noise = channels.noise * (free + NOISE_SIGMAS * np.sqrt(2.0 * free))
         squares = sum(first[layers] ** 2 for first in sums.firsts)
         error = np.maximum(sums.second[layers] - squares / np.maximum(count, 1.0) - noise, 0.0)
@@ -356,19 +356,19 @@ def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.fl
 
 
 def _may_be_divided(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
-    """Whether halves of blocks of this depth, of roots of these edges (n,), mm, are as long as the smallest."""
+    """True if halves of blocks of this depth are long enough; `edge` (n,) are the roots' edges, mm."""
     return bool(edge.min() / 2 ** (depth + 1) >= limits.smallest)
 
 
 def _is_too_large(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
-    """Whether all blocks of this depth must be divided."""
+    """True if all blocks of this depth must be divided."""
     return bool(limits.largest * (1.0 + 1e-9) < edge.max() / 2**depth) and _may_be_divided(edge, depth, limits)
 
 
 def _depths(
     edge: NDArray[np.float64], roots: tuple[int, ...], spacing: NDArray[np.float64], limits: _BlockLimits
 ) -> tuple[int, int]:
-    """The depths to which roots of these edges (n,), mm, may be divided at all, and for the content's sake."""
+    """Largest depths to which roots with edges (n,), mm, may be divided at all, and for their content."""
     n_by_content = 0
     while True:
         half = edge / 2 ** (n_by_content + 1)
@@ -388,15 +388,15 @@ def _depths(
 
 
 def _least_edge(limits: _BlockLimits, n: int) -> float:
-    """The edge, mm, that blocks may have where they have to be smallest."""
+    """The least edge, mm, that blocks may need."""
     return min(limits.largest, np.inf if limits.target is None else float(limits.target.min()) / USUAL_IN_BLOCK[n])
 
 
 def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
-    """Which blocks of an edge are divided for the sake of their targets for the usual edge of cells, mm.
+    """Mask of the blocks with this edge to divide for their targets for the usual edge of cells, mm.
 
-    Divided, a block has 2^n times the nodes. To have k times as many, one in (2^n - 1) / (k - 1) is, which ones as
-    `_uneven` has it.
+    A divided block has 2^n times the nodes. For k times as many, one in (2^n - 1) / (k - 1) is divided, selected by
+    `_uneven`.
     """
     n = target.ndim
     more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
@@ -405,22 +405,22 @@ def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
 
 
 def _uneven(*index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Factors 1 to 1 + `TIE_SPREAD`, all different: of blocks that are alike first some are divided, here and there.
+    """Distinct factors from 1 to 1 + `TIE_SPREAD`, so that blocks that are alike are not all divided at once.
 
-    `index` has the blocks' places along each axis. The fractional parts of multiples of the plastic number's powers
-    fill any region evenly (Roberts 2018).
+    `index` holds the blocks' positions along each axis. The fractional parts of multiples of the plastic number's
+    powers fill any region evenly (Roberts 2018).
     """
     place = sum(factor * along for factor, along in zip(UNEVEN_FACTORS, index, strict=False))
     return 1.0 + TIE_SPREAD * np.mod(place, 1.0)
 
 
 def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
-    """Minima over equal blocks: a voxel counts where its centre is; a block without centres has no target."""
+    """Minima over equal blocks: a voxel belongs to the block of its centre; a block without centres has no target."""
     for axis, count in enumerate(counts):
         size = data.shape[axis]
         start = block_starts(size, count)
         length = np.diff(start, append=size)
-        # The first voxel of each block, the second of each that has one, ...: five times as fast as `reduceat`.
+        # The first voxel of each block, then the second of each that has one, ...: five times as fast as `reduceat`.
         data = np.moveaxis(data, axis, 0)
         least = data[np.minimum(start, size - 1)]
         least[length == 0] = NO_BOUND_MM
@@ -434,10 +434,10 @@ def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
 def _best_division(
     content: Content, nodes: int, limits: _BlockLimits
 ) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
-    """Numbers of roots along each axis, and which blocks are divided, of the octree with most nearly so many nodes.
+    """Numbers of roots along each axis, and the divided blocks, of the octree with the nearest number of nodes.
 
-    Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
-    undivided blocks: then others are tried, at last the lattice that has the number by itself.
+    If many blocks are alike, all or none of them are divided, and some numbers cannot be reached from one size of
+    undivided blocks. Then other sizes are tried, finally the lattice that has the number undivided.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     image, channels = content.image, channels_of(content)
@@ -456,17 +456,17 @@ def _best_division(
     if best is None:
         least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits, image.ndim)
         raise InputError(
-            f"sizes: edges of {least:.3g} mm are asked for, but blocks below a voxel ({image.spacing.max():.3g} mm) "
-            "see nothing; allow longer ones"
+            f"sizes: the requested edges of {least:.3g} mm need blocks smaller than a voxel "
+            f"({image.spacing.max():.3g} mm); allow longer ones"
         )
     return best[1:]
 
 
 def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
-    """Numbers of roots along each axis to try, within the limits: the largest blocks first.
+    """Numbers of roots along each axis to try, within the limits, the largest blocks first.
 
-    With a region at last the lattice that has the nodes within it: of leaves that are as small as they may be no
-    coarser one has as many.
+    With a region, the last is the lattice that has the nodes within it: if leaves may not be smaller, no coarser one
+    has as many.
     """
     image, largest, smallest = content.image, limits.largest, limits.smallest
     lengths = image.spacing * image.shape
@@ -491,11 +491,11 @@ def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator
 def _division(
     blocks: list[_Blocks], roots: tuple[int, ...], nodes: int, n_rings: int
 ) -> tuple[int, list[NDArray[np.bool_]]]:
-    """The number of nodes nearest to `nodes`, and which blocks are divided: those with an error above a threshold.
+    """The number of nodes nearest to `nodes`, and the divided blocks, whose error exceeds a threshold.
 
     The threshold is found by bisection.
     """
-    # A finer block may hold the largest error: noise is taken off the coarser ones, too.
+    # A finer block may have the largest error, as noise is subtracted from coarser ones, too.
     above = [at_depth.error[at_depth.error > 0.0] for at_depth in blocks[:-1]]
     ends = [(float(errors.min()), float(errors.max())) for errors in above if len(errors)]
     low, high = (0.5 * min(ends)[0], 2.0 * max(high for _, high in ends)) if ends else (1.0, 1.0)
@@ -505,8 +505,8 @@ def _division(
     for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
-        # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number
-        # that is counted, and it rises as the threshold falls.
+        # For far too many leaves, each with its centre, a bound of the nodes suffices: it is no nearer than any counted
+        # number, and it rises as the threshold falls.
         n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(int(np.count_nonzero(each)) for each in divided)
         is_skipped = not regions and n_leaves > SKIPPED_RATIO * nodes
         count = NODES_OF_LEAF * n_leaves if is_skipped else len(leaf_nodes(divided, roots, regions).codes)
@@ -519,14 +519,14 @@ def _division(
 
 
 def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
-    """Which blocks of each depth are divided, if those above the threshold or too large are.
+    """Masks of the blocks to divide at each depth, if those above the threshold or too large are divided.
 
-    Around a divided block, `n_rings` blocks of its size exist in every direction: with one, neighbours differ by one
-    division at most.
+    A divided block is surrounded by `n_rings` blocks of its size in every direction: with one, neighbours differ by at
+    most one division.
     """
     divided = [(at_depth.error > threshold) | at_depth.is_too_large for at_depth in blocks[:-1]]
     for depth in range(len(divided) - 1, 0, -1):
-        # These blocks have to exist:
+        # These blocks must exist:
         near = _dilated(divided[depth], n_rings)
         for axis in range(near.ndim):
             near = np.asarray(near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1))
@@ -535,7 +535,7 @@ def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDAr
 
 
 def _dilated(chosen: NDArray[np.bool_], n_rings: int) -> NDArray[np.bool_]:
-    """Blocks that are chosen or within so many rings of one; not by scipy, whose filters take 0.08 s to load."""
+    """Blocks that are chosen or within `n_rings` of one, without scipy, whose filters take 0.08 s to load."""
     for axis in range(chosen.ndim):
         for _ in range(n_rings):
             before, chosen = np.moveaxis(chosen, axis, 0), chosen.copy()

@@ -1,4 +1,4 @@
-"""How small and how large cells of a graded mesh may be: targets by place, bounds, and how fast sizes may change."""
+"""Sizes of the cells of a graded mesh: targets by place, bounds, and gradation."""
 
 from __future__ import annotations
 
@@ -15,73 +15,72 @@ from tetopt.image import Image
 from tetopt.start.lattice import near_cubes
 from tetopt.system.kernel_cache import njit
 
-# A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set
+# Default ratio of a graded mesh's longest edge to that of a uniform mesh with as many nodes
 # (`docs/understand/sizes.md`).
 COARSEST_RATIO = 1.4
-# By dimension, the shortest, the mean and the longest edge of the cells in a block over the block's own edge: from a
-# corner to the centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the
-# box's faces.
+# By dimension, the shortest, mean and longest edge of the cells in a block over the block's edge: from a corner to the
+# centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the box's faces.
 SHORTEST_IN_BLOCK = {2: 0.5**0.5, 3: 0.75**0.5}
 USUAL_IN_BLOCK = {2: (2.0 * 0.5**0.5 + 1.0) / 3.0, 3: (4.0 * 0.75**0.5 + 3.0) / 7.0}
-LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}  # in 2-D the side itself is as long as the block
+LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}  # in 2-D the longest is the block's side
 # Nodes of equilateral cells by dimension, times edge^n per volume. In 3-D a cell has edge^3 / (6 sqrt 2), and the solid
 # angle 3 arccos(1/3) - pi at each of its corners, of the 4 pi around a node.
 EQUILATERAL_NODES = {
     2: 2.0 / 3.0**0.5,
     3: 6.0 * 2.0**0.5 * (3.0 * np.arccos(1.0 / 3.0) - np.pi) / np.pi,
 }
-STAIRCASE_RATIO = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # a surface over its voxels' sides, over all directions
-SIZED_OVER_EQUILATERAL = 1.5  # nodes that targets take: cells of an image are neither regular nor all of one size
-LONG_EDGE = 2.0**0.5  # over its target: a longer edge is split, as in MMG, since its halves are nearer to it
-SHORT_EDGE_FRACTION = 0.5**0.5  # of its target: a shorter edge is one that the image has made
-RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))  # edges over target: 1/8 to 4, four to a doubling
-NO_BOUND_MM = 1e30  # stands for infinity in float32, to which steps can still be added
-UNEVEN_RATIO = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
+STAIRCASE_RATIO = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # mean ratio, over all directions, of a surface to its voxels' sides
+SIZED_OVER_EQUILATERAL = 1.5  # nodes that targets take: cells of an image are neither regular nor uniform
+LONG_EDGE = 2.0**0.5  # ratio to the target above which an edge is split, as in MMG, since its halves are nearer to it
+SHORT_EDGE_FRACTION = 0.5**0.5  # ratio to the target below which the image has made an edge
+RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))  # edge over target: 1/8 to 4, four per doubling
+NO_BOUND_MM = 1e30  # infinity for float32, to which steps can still be added
+UNEVEN_RATIO = 1.5  # longest edge of a cell over the edge from gradation: edges of a good cell differ by a third
 
 
 class Sizes(NamedTuple):
-    """Targets and limits for the edges of cells where `octree_mesh` and the exchanges of `optimize` put nodes.
+    """Targets and limits for the edges of cells in `octree_mesh` and the exchanges of `optimize`.
 
-    A target (`edge_size`, `field`) is for the usual edge: octrees begin near it, edges over sqrt 2 times it are split,
-    as far as there are nodes, and no collapse makes one. Where the image is worth it, cells are smaller. That takes up
-    to 1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest` are bounds. Nodes move in
-    between, which makes some edges longer or shorter: in the tests one in a hundred is more than 5 % longer than the
-    longest. `quality` tells the longest and the shortest.
+    A target (`edge_size`, `field`) is for the usual edge: octrees start near it, edges longer than sqrt 2 times the
+    target are split while nodes are available, and no collapse makes such an edge. Cells are smaller where the image
+    has detail. This takes up to 1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest`
+    are bounds. Nodes move afterwards, which makes some edges longer or shorter: in the tests, one in a hundred is more
+    than 5 % longer than `longest`. `quality` reports the longest and the shortest.
 
     Parameters
     ----------
     smallest : float
-        No block and no split makes a shorter edge, mm, and no target is below it. Where not both can be, this is kept
-        rather than `longest`. Nodes then move nearer: in one run a tenth of the edges ended shorter.
+        No block and no split makes a shorter edge, mm, and no target is below it. It takes precedence over `longest`.
+        Nodes may move nearer afterwards: in one run a tenth of the edges ended shorter.
     edge_size : float, optional
-        The target, mm, everywhere, and the largest where `field` has one; `inf` for none.
+        Target everywhere, mm, and upper limit of `field`; `inf` for none.
     gradation : float, optional
-        How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
-        1 / gradation blocks wide; 1, the default, to 0.05. Targets grow by no more than gradation x distance, and
-        collapses make no edge longer than 1.5 times the size that grows so from its surroundings. Where there are
-        hardly two sizes it changes little.
+        Rate at which sizes may change, 0.05 (gentle) to 1, the default. Between the next smaller and the next larger
+        size, each size of the octree is at least 1 / gradation blocks wide. Targets grow by at most gradation x
+        distance, and collapses make no edge longer than 1.5 times the size that grows from its surroundings at this
+        rate. It has little effect if there are hardly two sizes.
     field : Image, optional
-        The target, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
-        where it is 0 or below, only `edge_size` is one.
+        Target by place, mm: an image that need not share the voxels of the meshed image. Outside its box, and where it
+        is 0 or below, only `edge_size` applies.
     coarsest : float, optional
-        Without `edge_size` and `longest`: the longest edge over that of a uniform mesh with as many nodes, by default
-        1.4.
+        Ratio of the longest edge to that of a uniform mesh with as many nodes, used without `edge_size` and `longest`;
+        by default 1.4.
     longest : float, optional
-        No block and no collapse makes a longer edge, mm. By default, without `edge_size`, `coarsest` times the longest
-        edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
-        better, but the displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of
-        blocks on the box's faces.
+        No block and no collapse makes a longer edge, mm; `inf` for no limit. By default, without `edge_size`,
+        `coarsest` times the longest edge of a uniform mesh with as many nodes: smaller cells in uniform regions improve
+        the displacement, not the image. Most edges are 0.6 times the longest, which are diagonals of blocks on the
+        box's faces.
     cells_across : float, optional
-        So many cells lie across a label where it is thin: the target is its local thickness by as much
-        (`sizes_by_label`), not below `smallest` or a voxel. Label 0 is background, and has no such target.
+        Number of cells across a label where it is thin: the target is its local thickness divided by this number
+        (`sizes_by_label`), not below `smallest` or a voxel. Label 0 is background and has no such target.
     by_label : mapping of int to float, str or LabelSize, optional
-        Targets by label, "*" for all others, 0 among them: mm, or a part of the local thickness t, "0.6t", or
-        "0.6t[1:10]" between bounds in mm.
+        Targets by label, with "*" for all others including 0: mm, or a fraction of the local thickness t, such as
+        "0.6t", or "0.6t[1:10]" with bounds in mm.
 
     Raises
     ------
     InputError
-        Where they are used: a value out of range, a size that contradicts another, a field of another dimension.
+        At use: a value out of range, contradictory sizes, or a field of another dimension.
 
     Examples
     --------
@@ -107,11 +106,11 @@ class Sizes(NamedTuple):
 
     @property
     def has_target(self) -> bool:
-        """Whether there is a target anywhere."""
+        """True if there is a target anywhere."""
         return self.field is not None or (self.edge_size is not None and self.edge_size < np.inf)
 
     def prepared(self, n: int) -> Sizes:
-        """The same sizes, checked; the field's steps are lowered to the gradation.
+        """Check the sizes, and lower the field's steps to the gradation.
 
         Parameters
         ----------
@@ -121,12 +120,12 @@ class Sizes(NamedTuple):
         Returns
         -------
         Sizes
-            With a field whose neighbouring voxels differ by no more than gradation x distance.
+            The same, with a field whose neighbouring voxels differ by at most gradation x distance.
 
         Raises
         ------
         InputError
-            A value out of range, or a field of another dimension than n.
+            A value out of range, or a field whose dimension is not n.
 
         Examples
         --------
@@ -147,11 +146,11 @@ class Sizes(NamedTuple):
         if not 0.05 <= self.slope <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.cells_across is not None or self.by_label:
-            raise InputError("sizes: cells_across and by_label are settled by `sizes_by_label`, with the labels; do so")
+            raise InputError("sizes: cells_across and by_label depend on labels; call `sizes_by_label` first")
         if self.field is not None and self.field.ndim != n:
-            raise InputError(f"field: expected one in {n}-D, as the image is, got a {self.field.ndim}-D one")
+            raise InputError(f"field: expected a {n}-D field like the image, got a {self.field.ndim}-D one")
         if self.field is not None and not (self.field.data > 0.0).any():
-            raise InputError("field: no voxel is above 0; give lengths in mm")
+            raise InputError("field: expected lengths above 0 mm, got none")
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
@@ -160,16 +159,16 @@ class Sizes(NamedTuple):
         Parameters
         ----------
         image : Image
-            Whose box the mesh covers.
+            The image whose box the mesh covers.
         nodes : int
             Number of nodes of the mesh.
         volume : float, optional
-            Of the mesh, mm^n; by default of the box.
+            Volume of the mesh, mm^n; by default that of the box.
 
         Returns
         -------
         float
-            mm; `inf` where there is a target everywhere.
+            mm; `inf` if every place has a target.
 
         Examples
         --------
@@ -184,7 +183,7 @@ class Sizes(NamedTuple):
             return np.inf
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
-        if volume is not None:  # nodes of a lattice of the whole box
+        if volume is not None:  # nodes for a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
         coarsest = COARSEST_RATIO if self.coarsest is None else self.coarsest
@@ -193,15 +192,16 @@ class Sizes(NamedTuple):
     def on_voxels(self, image: Image) -> NDArray[np.float32]:
         """The target at each voxel's centre.
 
+
         Parameters
         ----------
         image : Image
-            Whose voxels are taken.
+            Image with the target voxels.
 
         Returns
         -------
         (s_0, ..., s_{n-1}) float32
-            Of the image's shape, mm; `NO_BOUND_MM` where there is none.
+            Targets in the image's shape, mm; `NO_BOUND_MM` where there is none.
 
         Examples
         --------
@@ -253,14 +253,14 @@ class Sizes(NamedTuple):
         return np.maximum(target, self.smallest)
 
     def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
-        """The target at nodes; where there is none, what grows by the gradation from where there are.
+        """The target at nodes; without one, the size that grows from other targets at the gradation.
 
         Parameters
         ----------
         points : (N, n) array of float64
             World mm.
         cells : (M, n+1) array of int64
-            Along whose edges it grows.
+            Cells along whose edges it grows.
 
         Returns
         -------
@@ -285,22 +285,22 @@ class Sizes(NamedTuple):
         self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
         volume: float | None = None,
     ) -> NDArray[np.float64]:  # fmt: skip
-        """The longest edge that a cell at each node may be given.
+        """The longest edge that a cell at each node may get.
 
         Parameters
         ----------
         image : Image
-            Whose box the mesh covers.
+            The image whose box the mesh covers.
         nodes : int
             Number of nodes of the mesh.
         points, cells : (N, n) float64, (M, n+1) int64
-            Nodes in world mm, and which of them each cell has.
+            Nodes in world mm, and the cells' node indices.
         own : (N,) float64
-            The mean size there now, mm.
+            Current mean size there, mm.
         target : (N,) float64
-            What it is to be, mm (`around`).
+            Target size there, mm (`around`).
         volume : float, optional
-            Of the mesh, mm^n; by default of the box.
+            Volume of the mesh, mm^n; by default that of the box.
 
         Returns
         -------
@@ -322,20 +322,20 @@ class Sizes(NamedTuple):
 
 
 def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None) -> float:
-    """How many nodes a mesh of equilateral cells would have whose edges are the targets at voxels, mm.
+    """Number of nodes of a mesh of equilateral cells whose edges are the targets at voxels, mm.
 
-    `target` is of the image's shape, and counts up to `NO_BOUND_MM`; `inside` says which voxels are to be meshed.
-    Nodes on the boundary have half of their room inside: so many are added, by its area over that of a triangle (in
-    2-D its length over that of an edge).
+    `target` has the image's shape and counts up to `NO_BOUND_MM`; `inside` is the mask of the voxels to mesh. Nodes on
+    the boundary have only half of their space inside, so nodes are added in proportion to its area over that of a
+    triangle (in 2-D its length over that of an edge).
     """
     n = image.ndim
     is_in = target < NO_BOUND_MM if inside is None else inside & (target < NO_BOUND_MM)
     edge = np.where(is_in, target, np.inf).astype(np.float64)
-    # Powers only where they are not 0, and below of steps alone: a fifth of the time of all.
+    # Powers are taken only where they are not 0, and below only at steps: a fifth of the time.
     density = np.power(edge, -n, where=is_in, out=np.zeros(edge.shape))
     nodes = EQUILATERAL_NODES[n] * image.voxel_volume * float(density.sum())
     of_facet = 0.5 * (EQUILATERAL_NODES[2] if n == 3 else 1.0)
-    across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)  # of a voxel's volume, to its sides' areas
+    across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)  # ratio of a voxel's sides to its volume
     for axis in range(n):
         area = of_facet * (image.voxel_volume * float(across[axis]))
         along = np.moveaxis(edge, axis, 0)
@@ -349,17 +349,17 @@ def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] |
 
 
 class EdgeRatios(NamedTuple):
-    """Edges over their targets, each edge once; those of which both ends have one."""
+    """Ratios of edges to their targets, for edges with targets at both ends."""
 
     mean: float
-    above: float  # fraction of edges over sqrt 2 times their target: there were no nodes to split them
-    below: float  # fraction of edges under 1 / sqrt 2 times their target: the image has made them so
-    edges_of_bins: tuple[float, ...]  # edge over target, B + 1, rising; the first and last bins hold what is beyond
-    fraction: list[float]  # (B,) of the edges in each bin
+    above: float  # fraction of edges over sqrt 2 times their target, for which nodes were lacking
+    below: float  # fraction of edges under 1 / sqrt 2 times their target, which the image has made
+    edges_of_bins: tuple[float, ...]  # bounds of edge over target, B + 1, ascending; end bins include values beyond
+    fraction: list[float]  # (B,) fraction of the edges in each bin
 
 
 def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | None:
-    """How the edges of a mesh meet the targets of sizes; None if no edge has any."""
+    """Ratios of the edges of a mesh to the targets of sizes; None if no edge has a target."""
     n, target = points.shape[1], sizes.prepared(points.shape[1]).at(points)
     first, second = np.triu_indices(n + 1, 1)
     a, b = cells[:, first].ravel(), cells[:, second].ravel()
@@ -375,9 +375,9 @@ def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | N
 
 
 def _graded(field: Image, gradation: float) -> Image:
-    """The field with no value above a neighbour's by more than gradation x distance, neighbours across voxel faces.
+    """Limit the field so that no value exceeds a face neighbour's by more than gradation x distance.
 
-    Voxels of 0 or less let sizes grow across, and stay without one.
+    Sizes grow across voxels of 0 or less, which stay without a size.
     """
     has_one = field.data > 0.0
     data = np.where(has_one, field.data, NO_BOUND_MM).astype(np.float32)
@@ -389,9 +389,9 @@ def _graded(field: Image, gradation: float) -> Image:
 
 @njit(cache=True, error_model="numpy")
 def _lower(data: NDArray, steps: NDArray) -> None:
-    """Lower each voxel to its least neighbour's value and a step, going forwards, then backwards over the voxels.
+    """Lower each voxel to its neighbours' least value plus a step, in a forward and a backward pass.
 
-    A shortest way may take all its steps forwards first, hence both.
+    A shortest way may take all its forward steps first, hence both passes.
     """
     s0, s1, s2 = data.shape
     for way in (1, -1):
@@ -413,7 +413,7 @@ def _lower(data: NDArray, steps: NDArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _around(size: NDArray, points: NDArray, cells: NDArray, gradation: float) -> NDArray:
-    """The least of the other nodes' size + gradation x distance, along edges, (N,)."""
+    """The least value of another node's size + gradation x distance along edges, (N,)."""
     reached = np.full(len(size), np.inf)
     is_changed = True
     while is_changed:

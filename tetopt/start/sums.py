@@ -1,8 +1,8 @@
 """Sums of an image's voxels over blocks, from one pass over boxes of them, in memory or stored.
 
-Of the voxels there are the channels h' = (h - mean) / scale, at most 1, so that numbers of nodes do not depend on the
-unit of intensity, and their squares. Each row is added to its block voxel by voxel, rows to their planes and planes to
-their blocks in their order: the sums are the same bits however the volume is cut into boxes.
+Sums are taken of the channels h' = (h - mean) / scale, at most 1, so that numbers of nodes do not depend on the unit of
+intensity, and of their squares. Each row is added to its block voxel by voxel, rows to their planes and planes to their
+blocks in order: the sums are the same to the last bit however the volume is divided into boxes.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from tetopt.system.kernel_cache import njit
 
 
 class Channels(NamedTuple):
-    """How values are made channels, and what is known of these; made by `channels_of`."""
+    """Scaling of values to channels, and numbers of these; made by `channels_of`."""
 
-    means: list[float]  # of the values, (C,)
-    scale: float  # their largest deviation from them
+    means: list[float]  # means of the values, (C,)
+    scale: float  # largest deviation of the values from the means
     noise: float  # variance
     step: float  # squared difference between the two sides of the mask's surface
 
     def scaled(self, values: NDArray, channel: int, inside: NDArray | None) -> NDArray[np.float64]:
-        """The channel's values less their mean, at most 1; 0 outside of the mask."""
+        """The channel's values minus their mean, scaled to at most 1; 0 outside the mask."""
         deviations = np.subtract(values, self.means[channel], dtype=np.float64, order="C")
         deviations /= self.scale
         if inside is not None:
@@ -40,14 +40,14 @@ class Channels(NamedTuple):
 
 
 def channels_of(content: Content) -> Channels:
-    """The channels of a content, from one pass over its voxels where they are stored and their statistics not known.
+    """The channels of a content; stored voxels without known statistics take one pass.
 
     Raises
     ------
     InputError
-        Deviations whose squares overflow; of a stored image voxels that no `Image` takes.
+        Deviations whose squares overflow, or a stored image with voxels that are invalid for an `Image`.
     """
-    is_known = content.statistics is not None or content.image.in_memory is None  # else half of it will do
+    is_known = content.statistics is not None or content.image.in_memory is None  # otherwise half of them suffice
     if content.is_plain and content.region is None and content.image.ndim == 3 and is_known:
         known = statistics(content.image) if content.statistics is None else content.statistics
         _check_squares(known.scale, content.n_voxels)
@@ -60,7 +60,7 @@ def channels_of(content: Content) -> Channels:
     _check_squares(scale, size)
     scale = scale or 1.0
     result = Channels(means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2)
-    # The noise is that of values at most 1, too: its estimate rounds differently otherwise.
+    # The noise is estimated on scaled values, too, as the estimate would round differently otherwise.
     within = None if content.inside is None else noise_sample(content.inside)
     noise = 0.0
     for channel, values in enumerate(content.values[: content.n_contrasts]):
@@ -72,28 +72,28 @@ def channels_of(content: Content) -> Channels:
 
 
 def _check_squares(scale: float, n_voxels: int) -> None:
-    """InputError if the squares of deviations up to this one may not be summed."""
+    """Raise InputError if sums of squares of deviations up to this one may overflow."""
     if not np.isfinite(scale * scale * n_voxels):
-        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
+        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale the image first")
 
 
 class BlockSums(NamedTuple):
-    """Sums over equal blocks, each of the blocks' shape."""
+    """Sums over equal blocks, each in the blocks' shape."""
 
-    lengths: list[NDArray[np.float64]]  # voxels along each axis, of the blocks at each place along it
-    inside: NDArray[np.float64] | None  # voxels inside the mask; without one all are
-    second: NDArray[np.float64]  # of all channels' squares
-    firsts: list[NDArray[np.float64]]  # of each channel
+    lengths: list[NDArray[np.float64]]  # voxels along each axis, for the blocks at each position on it
+    inside: NDArray[np.float64] | None  # voxels inside the mask; None without a mask
+    second: NDArray[np.float64]  # sums of all channels' squares
+    firsts: list[NDArray[np.float64]]  # sums of each channel
 
     def voxels(self, layers: slice) -> NDArray[np.float64]:
-        """All voxels of the blocks in these layers along the first axis."""
+        """Number of voxels of the blocks in these layers along the first axis."""
         product = self.lengths[0][layers]
         for length in self.lengths[1:]:
             product = product[..., None] * length
         return product
 
     def coarser(self) -> BlockSums:
-        """Those of blocks of twice the edge."""
+        """The sums over blocks of twice the edge."""
         return BlockSums(
             [halved(length, np.add) for length in self.lengths],
             None if self.inside is None else halved(self.inside, np.add),
@@ -111,15 +111,15 @@ def halved(totals: NDArray, total_of: np.ufunc) -> NDArray:
 
 
 def block_starts(size: int, count: int) -> NDArray[np.int64]:
-    """The first voxel of each of so many equal blocks along an axis: a voxel is where its centre is.
+    """The first voxel of each of `count` equal blocks along an axis; a voxel belongs to the block of its centre.
 
-    Where blocks are smaller than voxels, one that has no centre starts where the next one does, or at the end.
+    If blocks are smaller than voxels, a block without centres starts where the next one does, or at the end.
     """
     return np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
 
 
 def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
-    """Sums over so many equal blocks along each axis, from one pass over the voxels."""
+    """Sums over `counts` equal blocks along the axes, from one pass over the voxels."""
     shape = content.image.shape
     starts = [block_starts(size, count) for size, count in zip(shape, counts, strict=True)]
     lengths = [np.diff(start, append=size).astype(np.float64) for start, size in zip(starts, shape, strict=True)]
@@ -130,7 +130,7 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
     )
     n_fields = 1 + len(channels.means) + (content.inside is not None)
     totals = np.zeros((n_fields, *(len(start) for start in starts)))
-    of_open = np.empty(0)  # sums of a block that goes on in the next box of the same planes
+    of_open = np.empty(0)  # sums of a block that continues in the next box of the same planes
     for box, values, inside in _boxes_of(content):
         first, last = of_row[box[1].start], of_row[box[1].stop - 1]
         sums = np.zeros((n_fields, values.shape[1], last - first + 1, len(starts[2])))
@@ -151,7 +151,7 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
 
 
 def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
-    """Boxes of whole rows, plane after plane: their voxels, (C, P, R, K), and which are inside, (P, R, K)."""
+    """Boxes of whole rows, plane by plane: their voxels, (C, P, R, K), and the mask of those inside, (P, R, K)."""
     image, channels, inside = content.image, content.channels, content.inside
     for box in image.boxes():
         own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)
@@ -165,7 +165,7 @@ def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_
 def _fields(
     values: NDArray, inside: NDArray[np.bool_] | None, channels: Channels, piece: Box
 ) -> Iterator[NDArray[np.float64]]:
-    """What is summed of a piece of voxels: squares, each channel, and with a mask 1 inside of it."""
+    """The fields to sum over a piece of voxels: squares, each channel, and with a mask 1 inside it."""
     within = None if inside is None else inside[piece]
     scaled = [channels.scaled(part[piece], channel, within) for channel, part in enumerate(values)]
     square = scaled[0] * scaled[0]
@@ -181,7 +181,7 @@ def _fields(
 def _add_rows(field: NDArray, block_of_row: NDArray, ends: NDArray, totals: NDArray) -> None:
     """Add each row of voxels (P, R, K) to its plane's sums over blocks (P, B, C), voxel by voxel.
 
-    `block_of_row` (R,) numbers its B; block c is of voxels ends[c] to before ends[c + 1], (C + 1,).
+    `block_of_row` (R,) is each row's block; block c has voxels ends[c] to ends[c + 1] - 1, (C + 1,).
     """
     for p in range(field.shape[0]):
         for r in range(field.shape[1]):
