@@ -485,7 +485,7 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
         ({TETRA: [[0, 1, 2, 3]], QUAD: [[0, 1, 4, 2]]}, "found quad"),
         (
             {TETRA: [[0, 1, 2, 3]], QUADRATIC: [[0, 1, 2, 4, 4, 5, 0, 1, 2, 3]]},
-            "expected cells of one order, found tetra cells of order 1 and of order 2",
+            "expected cells of one order, found tetra cells of both order 1 and order 2",
         ),
         ({QUADRATIC - 2: [[0, 1, 2, 3, 4, 5]]}, "plane z = 0"),
         ({QUADRATIC: [[0, 1, 2, 2, 4, 5, 4, 5, 4, 5]]}, "1 of 1 are flat"),
@@ -519,8 +519,8 @@ def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
         ("0 1 2 2", "1", "1 of 1 are flat"),
         ("0 1 2 3", "nan", "must be finite, node 3"),
         ("0 1 2 3", "inf", "must be finite, node 3"),
-        ("0 1 2 7", "1", "nodes 0..7, it holds 0..4"),
-        ("0 1 2 -1", "1", "nodes -1..2, it holds 0..4"),
+        ("0 1 2 7", "1", "nodes 0..7, it has 0..4"),
+        ("0 1 2 -1", "1", "nodes -1..2, it has 0..4"),
         ("0 1 2", "1", "damaged"),
     ],
 )
@@ -533,4 +533,4 @@ def test_a_middle_node_that_there_is_not(tmp_path, assert_refused):
     text = VTU.format(nodes="0 1 2 3 4 4 4 4 4 9", z="1")
     text = text.replace('"ascii">10<', '"ascii">24<').replace('"ascii">4<', '"ascii">10<')
     (tmp_path / "a.vtu").write_text(text)
-    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it holds 0..4; damaged")
+    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it has 0..4; damaged")
