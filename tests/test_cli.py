@@ -482,7 +482,7 @@ def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
     for name in ("a.nii", "b.nii", "a.json"):
         (tmp_path / name).write_text("old")
     new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert_refused(capfd, mesh, "a.json: exists already; pass --force")
+    assert_refused(capfd, mesh, "a.json: already exists; pass --force")
     assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
     assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
     assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
@@ -826,7 +826,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("a file")
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: the folder for the results cannot be made")
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: cannot create the folder for the results")
     assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
     names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert {each.name for each in (tmp_path / "new" / "deep").iterdir()} == names

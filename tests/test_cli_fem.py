@@ -176,8 +176,8 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{model}", "--load", "hold:inferor"], "did you mean inferior?"),
         (["{model}", "--load", "pressure:left:1"], "mesh: nothing holds it, neither a displacement nor a spring"),
         (["{model}", "--load", "move:left:0,free,free"], "can still turn or slide as a whole"),
-        (["{model}", "-o", "{model}", "--force"], "is an input of this command too"),
-        (["{model}", "-o", "out.inp"], "out.inp: expected a name that ends in .vtu or .vtk"),
+        (["{model}", "-o", "{model}", "--force"], "is also an input"),
+        (["{model}", "-o", "out.inp"], "out.inp: expected a name ending in .vtu or .vtk"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_nothing_is_written(words, message, path, tmp_path, capsys, monkeypatch):

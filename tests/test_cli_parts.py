@@ -158,7 +158,7 @@ def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, 
         planted(kind, place, elsewhere)
     before = content(tmp_path)
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away, and run this again")
+    assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away and run this again")
     assert content(tmp_path) == before
 
 
@@ -176,7 +176,7 @@ def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inpu
     planted(kind, place / name, elsewhere)
     before = content(tmp_path)
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away, and run this again")
+    assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away and run this again")
     assert content(tmp_path) == before
 
 

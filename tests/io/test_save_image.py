@@ -52,7 +52,7 @@ def test_a_plane_lies_at_z_0(tmp_path):
 
 @pytest.mark.parametrize("name", ["a", "a.mha", "a.nii.zip", "a.img", "a.hdr", "a.png", "nii"])
 def test_a_name_of_another_format_is_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"expected a name that ends in \.nii or \.nii\.gz"):
+    with pytest.raises(InputError, match=r"expected a name ending in \.nii or \.nii\.gz"):
         save_image(tmp_path / name, Image(np.arange(24.0).reshape(2, 3, 4)))
     assert list(tmp_path.iterdir()) == []
 

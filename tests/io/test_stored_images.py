@@ -208,7 +208,7 @@ def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):
     (tmp_path / "c.zarr").write_text("mine")
     monkeypatch.chdir(tmp_path)
     command_refused(capfd, [*command[:-1], "c.zarr", "--force"], "expected a folder to write, found something else")
-    command_refused(capfd, [*command[:-1], "b.zarr", "--force"], "expected a file to write, found a folder of others")
+    command_refused(capfd, [*command[:-1], "b.zarr", "--force"], "expected a file to write, found an unrelated folder")
     command_refused(capfd, [*command[:-1], "no/c.zarr"], "its folder does not exist")
     command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a phantom in three dimensions")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "c.zarr"]

@@ -180,7 +180,7 @@ def test_separators_of_csv(tmp_path, separator):
 
 def test_csv_of_another_encoding(tmp_path):
     (tmp_path / "a.csv").write_bytes("name,young\nMäuse,2\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r'expected text in UTF-8, .* in Excel as "CSV UTF-8"'):
+    with pytest.raises(InputError, match=r'expected UTF-8 text, .* in Excel as "CSV UTF-8"'):
         load_mapping(tmp_path / "a.csv")
 
 

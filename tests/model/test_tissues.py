@@ -98,7 +98,7 @@ def test_rows_of_groups(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("white,2,41\ngrey", 'groups.csv: expected rows of a name and what it has, got "grey"'),
+        ("white,2,41\ngrey", 'groups.csv: expected rows of a name and values, got "grey"'),
         ("white,2\ngrey,", 'groups.csv: expected rows .* got "grey,"'),
         ("white,2,41\ngrey,41", "`merge`: label 41 is in two groups, white and grey"),
         ("name,labels\n", "groups.csv: `merge`: expected NAME=LABELS"),

@@ -236,7 +236,7 @@ def test_a_state_of_other_words_is_said_in_a_line(folder, words):
 
 
 def test_a_folder_of_another_run_is_refused(folder):
-    with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run writes there [^\n]*$"):
+    with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run is writing there [^\n]*$"):
         run(folder)
 
 
