@@ -121,7 +121,7 @@ def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, ca
     assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
     assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
     names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
-    assert f'no set of facets "top"; there are {names}' in " ".join(capsys.readouterr().err.split())
+    assert f'no set of facets "top"; known sets are {names}' in " ".join(capsys.readouterr().err.split())
 
 
 def test_measured_again(run, inputs, tmp_path, capsys):

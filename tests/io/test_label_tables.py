@@ -206,11 +206,11 @@ def test_a_name_means_its_labels(text, labels):
 
 
 def test_names_that_no_label_has():
-    with pytest.raises(InputError, match='label "livre": no label is called so; did you mean liver'):
+    with pytest.raises(InputError, match='label "livre": no label has this name; did you mean liver'):
         labels_named("livre", NAMES)
-    with pytest.raises(InputError, match="there are Spleen, liver, left lung"):
+    with pytest.raises(InputError, match="known names are Spleen, liver, left lung"):
         labels_named("xyzzy", NAMES)
-    with pytest.raises(InputError, match="no label has a name; give a table of them"):
+    with pytest.raises(InputError, match="labels have no names; give a table of names"):
         labels_named("liver", {})
     assert label_words(5, NAMES) == "5 (liver)"
     assert label_words(55, NAMES) == "55"

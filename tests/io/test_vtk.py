@@ -100,7 +100,7 @@ def test_point_data_of_another_length_is_refused():
     model = quadratic_model(3)
     for values in (np.ones(5), np.ones(len(model.point_data["displacement"]) + 1)):
         with pytest.raises(
-            InputError, match=r"^point data: expected a row for each of \d+ corner nodes or of \d+ in all"
+            InputError, match=r"^point data: expected one row per corner node \(\d+\) or per node \(\d+\)"
         ):
             vtu(model._replace(point_data={"odd": values}))
 
