@@ -93,7 +93,7 @@ def test_bins_that_are_none(count, spacing, match):
 def test_values_by_label():
     assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
     assert by_label(ByLabel({1: 2.5}, 7.0), np.array([0, 1, 9])).tolist() == [7.0, 2.5, 7.0]
-    with pytest.raises(InputError, match=r"given for 1, the mesh also has 0, 3 \(2 more\); give these"):
+    with pytest.raises(InputError, match=r"got 1, the mesh also has 0, 3 \(2 more\); give values for these"):
         by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
     with pytest.raises(InputError, match="has no labels"):
         by_label(ByLabel({1: 2.5}), None)
@@ -106,7 +106,7 @@ def test_values_by_name():
     assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [1.0, 2.5, 1.0, 4.0]
     with pytest.raises(InputError, match=r"label 3 \(left lung\) has two values"):
         by_label(ByLabel({3: 2.5, "left lung": 4.0}), labels, names)
-    with pytest.raises(InputError, match=r"given for liver, the mesh also has 0 \(air\), 3 \(left lung\)"):
+    with pytest.raises(InputError, match=r"got liver, the mesh also has 0 \(air\), 3 \(left lung\)"):
         by_label(ByLabel({"liver": 4.0}), labels, names)
     with pytest.raises(InputError, match="did you mean left lung"):
         by_label(ByLabel({"left lnug": 4.0}, 1.0), labels, names)
