@@ -895,7 +895,7 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     sizes = tetopt.Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
     assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
-    line = f"edges over their target size: {met['mean']:.2f} in the mean; {met['below']:.1%} under 0.71"
+    line = f"ratio of edges to their target size: {met['mean']:.2f} on average; {met['below']:.1%} are below 0.71"
     assert line in capfd.readouterr().out
     assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
     numbers = numbers_in(tmp_path / "a.json")

@@ -645,7 +645,7 @@ def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, cap
     assert (data["fields"][0]["name"], data["fields"][0]["limits"]) == ("rho", [0.1, 0.3])
     capsys.readouterr()
     for options, message in (
-        (["--field", "young"], '--field: the mesh has no "young"; it has mean'),
+        (["--field", "young"], '--field: the mesh has no field "young"; it has mean'),
         (["--range", "3"], "--range: expected LOW,HIGH, such as 0,120"),
         (["--range", "low,3"], '--range: expected a number, got "low"'),
         (["--range", "3,2"], "--range: expected LOW,HIGH with LOW below HIGH"),

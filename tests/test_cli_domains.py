@@ -141,7 +141,7 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert [each["labels"] for each in again["contacts"]] == [each["labels"] for each in first["contacts"]]
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
-    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact over 1.2 times the"):
+    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact beyond 1.2 times that"):
         assert words in said
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
@@ -337,4 +337,4 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         said = capsys.readouterr()
         assert ("overlap only by Dice 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
-        assert "one of them is not there" in said.out
+        assert "one of them is missing" in said.out

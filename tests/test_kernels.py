@@ -446,7 +446,10 @@ def test_what_others_can_have_written_is_not_loaded(use):
         path.write_bytes(path.read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
         UNTRUSTED[words](path)
     *said, _ = use()
-    assert all(any(words in line and f"another user could have written those in {folder}" in line for line in said) for words in kinds)
+    assert all(
+        any(words in line and f"another user could have written those in {folder}" in line for line in said)
+        for words in kinds
+    )
     assert not executed.exists()
     assert use() == [LOADED]
     indices[0].write_bytes(indices[0].read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)

@@ -147,7 +147,11 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 integers each, got float64"),
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 integers each, got .*1, 3"),
         ("meshio", meshio.Mesh(CORNERS, [("tetra10", [range(9)])]), r"tetra10 cells of 10 whole numbers"),
-        ("meshio", meshio.Mesh(np.zeros((10, 4)), [TETRA]), r"two or three real coordinates, got float64 of shape \(10, 4"),
+        (
+            "meshio",
+            meshio.Mesh(np.zeros((10, 4)), [TETRA]),
+            r"two or three real coordinates, got float64 of shape \(10, 4",
+        ),
         ("meshio", meshio.Mesh(CORNERS[:, :1], [TETRA]), "two or three real numbers"),
         ("meshio", meshio.Mesh(CORNERS * 1j, [TETRA]), "real numbers, got complex128"),
         ("meshio", meshio.Mesh([["a"] * 3] * 4, [TETRA]), "points of real numbers"),
