@@ -488,7 +488,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
 @pytest.mark.parametrize(
     ("out", "more", "match"),
     [
-        ("a.foo", [], "unknown suffix; known are .vtu (VTK, ParaView), .vtk"),
+        ("a.foo", [], "unknown suffix; known suffixes are .vtu (VTK, ParaView), .vtk"),
         ("a.inp", ["--young", "1 + x"], 'cannot use "x"'),
         ("a.inp", ["--young", "0:1,100:5,50:3"], "--young: intensities must increase, got 100 and then 50"),
         ("a.inp", ["--young", "2", "--nu", "0:x"], "--nu: expected pairs intensity:value"),
@@ -514,7 +514,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
         ("a.stl", ["--order", "2"], "--order 2 is for .vtu, .vtk, "),
-        ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
+        ("a.inp", ["--load", "compress:5%"], "loads need materials"),
         ("a.inp", ["--set", "x=above:3"], "expected NAME=below:T"),
         ("a.feb", [], "needs a material; give a modulus mapping (--young)"),
         ("a.stl", ["--young", "2"], "holds the boundary alone"),
@@ -701,7 +701,7 @@ def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--slice", "k=99"], "a.nii.gz: --slice: index along axis 2 must be"),
+        (["--slice", "k=99"], "a.nii.gz: --slice: expected an index from"),
         (["--nodes", "6"], "tetopt: --nodes: expected a whole number of nodes"),
         (["--load", "hold:nowhere", "--young", "2"], 'tetopt: --load: no set of facets "nowhere"'),
         (["--edge-size", "-1"], "tetopt: --edge-size: expected a length above 0 mm"),

@@ -289,7 +289,7 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     command = ["mesh", inputs / "image.nii.gz", "--uniform", "--nodes", "300", "--iterations", "0"]
     command += ["-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--mask"]
     assert exit_code(*command, tmp_path / "four.nii.gz") == 2
-    assert "the file holds 2 volumes; choose one, 0 to 1" in capsys.readouterr().err
+    assert "the file has 2 volumes; choose one from 0 to 1" in capsys.readouterr().err
     assert exit_code(*command, f"{tmp_path / 'four.nii.gz'}:1") == 0
     assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data.sum()
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh

@@ -199,4 +199,4 @@ def test_predicted_parts(tmp_path, inputs, capfd):
 
 def test_places_on_the_network_are_refused(tmp_path, capfd):
     words = ["mesh", "s3://bucket/x.zarr", "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, words, "s3:/bucket/x.zarr: is not on this machine; download it")
+    assert_refused(capfd, words, "s3:/bucket/x.zarr: expected a local file or folder, got a URL; download it")

@@ -295,7 +295,7 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
 
 
 def test_several_steps_are_several_files():
-    with pytest.raises(InputError, match="febio: a file is one step, got 2"):
+    with pytest.raises(InputError, match="febio: expected one step, got 2"):
         febio(loaded_model(["1/hold:left", "2/hold:left"]))
 
 

@@ -111,10 +111,10 @@ def test_a_child_has_limits(some_file):
 @pytest.mark.parametrize(
     ("read", "words"),
     [
-        (crash, r"a test crashed at this file \(SIGABRT; .* copy or export it again"),
+        (crash, r"a test crashed on this file \(SIGABRT; .* copy or export it again"),
         (greedy, r"needs more than 2\.1 GB of memory"),
         (stumbling, r"truncated or damaged; copy it again \(KeyError: 'what\\nis this'\)"),
-        (endless, "was not read within 1 s by a test"),
+        (endless, "a test did not read it within 1 s"),
     ],
 )
 def test_a_child_that_fails_is_one_line(some_file, monkeypatch, read, words):
@@ -181,7 +181,7 @@ VTK_BOMBS = {
     "minus.vtk": (legacy(points=-1), "POINTS is -1"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),
     "field.vtk": (legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"), "is 2147483647"),
-    "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed at this file .SIG"),
+    "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed on this file .SIG"),
 }
 
 
@@ -306,7 +306,7 @@ def test_voxels_lie_beside_their_header(tmp_path, name):
     }
     for header, raw in headers.items():
         (inner / header).write_bytes(raw)
-        refused(load_image, inner / header, "only a file beside the header, by its bare name, is read|damaged")
+        refused(load_image, inner / header, "given by its bare name|damaged")
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_no_header_hides_where_its_voxels_are(tmp_path, header):
     if header.startswith("#"):
         header = header * 11_000 + "data file: ../a.raw\n"
     (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
-    refused(load_image, tmp_path / "inner" / "a.nhdr", "by its bare name, is read|a header of more than 1048576 bytes")
+    refused(load_image, tmp_path / "inner" / "a.nhdr", "given by its bare name|a header of more than 1048576 bytes")
 
 
 def test_no_list_of_files_goes_on_unread(tmp_path):
@@ -374,8 +374,8 @@ def test_nifti_bombs(tmp_path, name):
     assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
     refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13")
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
-    refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels are to begin at byte 1e.30")
-    refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels are to begin at byte nan")
+    refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels would begin at byte 1e.30")
+    refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels would begin at byte nan")
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nrrd"])
@@ -386,14 +386,14 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
     monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
     refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* are free; crop or resample it first")
     if name == "a.nrrd":
-        refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, of which parts are read$")
+        refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$")
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nii"])
 def test_a_file_that_goes_on(tmp_path, name):
     """Only as much is unpacked, or read for the checksum, as the header tells of, and what may lie behind that."""
     path = nifti(tmp_path / name, data=bytes(2**25))
-    refused(load_image, path, "it goes on far behind the last voxel")
+    refused(load_image, path, "it continues far after the last voxel")
 
 
 SKIPPED = {"a.mha": "", "a.mhd": f"HeaderSize = {2**25}\n", "a.nrrd": f"byte skip: {2**25}\n"}
@@ -415,7 +415,7 @@ def test_voxels_after_a_header_that_go_on(tmp_path, name):
         if more:
             assert checked_header(path)[1] == 60
         else:
-            refused(load_image, path, "it goes on far behind the last voxel")
+            refused(load_image, path, "it continues far after the last voxel")
 
 
 def test_postscript_in_a_picture(tmp_path):
@@ -430,7 +430,7 @@ def test_a_picture_of_too_many_pixels(tmp_path):
     data = zlib.compress(b"")
     body += struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-    refused(load_image, tmp_path / "a.png", "its 1048576 x 1048576 pixels are more than")
+    refused(load_image, tmp_path / "a.png", "expected at most 1073741824 pixels, got 1048576 x 1048576")
 
 
 # --------------------------------------------------------------------------------------------------
