@@ -462,7 +462,7 @@ def test_uneven_dicom_slices_in_words():
     assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(points, off)
 
 
-@pytest.mark.parametrize(("places", "words"), [(1, "at 1 place"), (2, "at 2 places")])
+@pytest.mark.parametrize(("places", "words"), [(1, "1 position"), (2, "2 positions")])
 def test_dicom_series_of_several_volumes(tmp_path, sitk, places, words):
     """Of one slice in time the first and last place are the same, which is no singular affine."""
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4), places=places)
@@ -476,7 +476,7 @@ def test_dicom_slices_that_are_not_parallel(tmp_path, sitk):
 
 @pytest.mark.parametrize("text", ["", "1\\2", "1\\2\\x", "1\\2\\nan"])
 def test_dicom_place_that_is_not_numbers(text):
-    with pytest.raises(InputError, match="should be 3 numbers, got"):
+    with pytest.raises(InputError, match="expected 3 numbers for the position"):
         _numbers(text, 3)
 
 
@@ -613,7 +613,7 @@ def test_unknown_suffix(tmp_path):
     path = tmp_path / "a.xyz"
     path.write_bytes(b"hello")
     known = ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp, .zarr"
-    assert_refused(path, f"unknown kind .*{re.escape(known)}, or a folder of DICOM files")
+    assert_refused(path, f"unknown image format.*{re.escape(known)}, or a folder of DICOM files")
 
 
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".mgz", ".nrrd", ".dcm", ".png"])
@@ -782,7 +782,7 @@ def test_no_orientation_warns(tmp_path):
 def test_box_of_another_unit_warns(tmp_path, step, match):
     affine = np.diag([step, step, step, 1.0])
     said = warnings_of(save_nifti(tmp_path / "a.nii", ramp(3, 4, 5), affine))
-    assert said == [] if match is None else f"a.nii: its box is {match} along its longest side" in said[0]
+    assert said == [] if match is None else f"a.nii: the longest side of its box is {match}" in said[0]
 
 
 def test_size_of_pictures_is_not_doubted(tmp_path):

@@ -137,7 +137,7 @@ def test_other_files(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_label_table(tmp_path)
     for encoding in ("latin-1", "utf-16"):
-        with pytest.raises(InputError, match="expected text in UTF-8"):
+        with pytest.raises(InputError, match="expected UTF-8 text"):
             table_of(tmp_path, SNAP, encoding=encoding)
 
 

@@ -225,11 +225,11 @@ BAD = {
     "counts": (changed("NumberOfCells", [192, 0]), "damaged"),
     "overflow": (changed("NumberOfCells", [2**62, 2**62, 2**63 - 1]), "damaged"),
     "minus": (changed("NumberOfCells", [-1, 97, 96]), "damaged: NumberOfCells is not"),
-    "planar": (changed("Points", np.zeros((4, 2))), "not three coordinates"),
+    "planar": (changed("Points", np.zeros((4, 2))), "do not have three coordinates"),
     "floats": (changed("Types", np.zeros(192)), "not lists of integers"),
     "group": (linked(np.zeros(3), "PointData"), '"PointData" is not a group'),
     "no cells": (lambda root: root.pop("Connectivity"), '"Connectivity" is not an array'),
-    "steps": (steps, "found steps of time"),
+    "steps": (steps, "found time steps"),
     "image": (attribute("Type", np.bytes_("ImageData")), "expected an unstructured grid, found ImageData"),
     "version": (attribute("Version", [3, 0]), "version 1 or 2"),
 }
@@ -267,6 +267,6 @@ def test_without_h5py_a_line_says_what_to_install(file_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     for call in (lambda: load_mesh(file_path), lambda: vtkhdf(sample_model())):
         with pytest.raises(
-            InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or take \.vtu'
+            InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or use \.vtu'
         ):
             call()
