@@ -405,7 +405,10 @@ BAD_METADATA = {
     "absolute": (set_in("datasets", 0, "path", "/etc"), "path: expected the name"),
     "no path": (set_in("datasets", 0, {}), "path: expected the name"),
     "link to elsewhere": (set_in("datasets", 0, "path", "s3://a/b"), "path: expected the name"),
-    "array that is not there": (set_in("datasets", 0, "path", "no\nthing"), re.escape(r'its array "no\nthing" is missing')),
+    "array that is not there": (
+        set_in("datasets", 0, "path", "no\nthing"),
+        re.escape(r'its array "no\nthing" is missing'),
+    ),
     "group in place of an array": (set_in("datasets", 0, "path", "."), "path: expected"),
 }
 

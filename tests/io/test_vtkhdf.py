@@ -266,7 +266,5 @@ def test_a_file_cut_off_and_cells_beyond_their_points(file_path):
 def test_without_h5py_a_line_says_what_to_install(file_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     for call in (lambda: load_mesh(file_path), lambda: vtkhdf(sample_model())):
-        with pytest.raises(
-            InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or use \.vtu'
-        ):
+        with pytest.raises(InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or use \.vtu'):
             call()
