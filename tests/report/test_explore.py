@@ -563,8 +563,8 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)  # at rest
     assert page["grey"]  # nodes without a value
     second, first, none = page["reactions"]
-    assert second == "held by 1,235 mN: R 0, A 0.5, S 1,235"
-    assert first == "held by 5 mN: R 3, A -4, S 0"
+    assert second == "reaction 1,235 mN: R 0, A 0.5, S 1,235"
+    assert first == "reaction 5 mN: R 3, A -4, S 0"
     assert none == ""
 
 
@@ -622,4 +622,4 @@ def test_it_fits_a_narrow_window(shown):
 
 @pytest.mark.deep
 def test_without_webgl_it_is_said(shown):
-    assert "This browser has no WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]
+    assert "This browser does not support WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]

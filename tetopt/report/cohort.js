@@ -215,7 +215,7 @@ function binsOf(c) {
     const [first, last] = [k === 0 ? -Infinity : ends[0], k === BINS - 1 ? Infinity : ends[1]];
     const isOpen = { low: k === 0 && isCutBelow, high: k === BINS - 1 && isCutAbove };
     const [least, most] = ends.map((end) => written(end, column.unit));
-    const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} and more` : `${least} to ${most}`;
+    const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} or more` : `${least} to ${most}`;
     return { words, ends, isOpen, holds: (value) => isNumber(value) && value >= first && value < last };
   });
 }
@@ -270,7 +270,7 @@ function drawCharts() {
   }
   const [usual, labels] = [false, true].map((is) => filled.filter((c) => data.columns[c].name.startsWith("labels.") === is));
   charts.replaceChildren(element("div", { className: "charts" }, ...usual.map(chartOf)));
-  if (same.length) charts.append(element("p", { className: "same", textContent: `The same in all that have it: ${same.join(", ")}.` }));
+  if (same.length) charts.append(element("p", { className: "same", textContent: `The same for all subjects that have it: ${same.join(", ")}.` }));
   if (!labels.length) return;
   const box = element("div", { className: "charts" });
   const details = element("details", {}, element("summary", { textContent: `Volumes of ${labels.length} labels` }), box);

@@ -25,14 +25,14 @@ function start() {
   const gl = webgl(canvas);
   if (!gl) {
     canvas.remove();
-    say("This browser has no WebGL 2, so the mesh cannot be shown; try another browser or machine.");
+    say("This browser does not support WebGL 2, so the mesh cannot be shown; try another browser or machine.");
     return;
   }
   const notes = data.skipped.length
-    ? [`Neither one number a cell nor one a node, so not shown: ${data.skipped.join(", ")}.`] : [];
+    ? [`Not shown, as they are not one number per cell or node: ${data.skipped.join(", ")}.`] : [];
   const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (data.image && Math.max(...data.image.shape) > most) {
-    notes.push(`This machine's graphics take up to ${most} voxels along an axis, so the image is not shown.`);
+    notes.push(`This graphics card supports at most ${most} voxels along an axis, so the image is not shown.`);
     data.image = null;
   }
   explore(gl, data, notes);
@@ -360,7 +360,7 @@ function explore(gl, data, notes) {
   function showReaction() {
     const force = state.set < 0 ? null : (data.reactions[state.step] || {})[sets[state.set].name];
     const parts = force && force.map((value, k) => `${SIDES[k][0]} ${number(value, 4)}`).join(", ");
-    $("reaction").textContent = force ? `held by ${number(Math.hypot(...force), 4)} mN: ${parts}` : "";
+    $("reaction").textContent = force ? `reaction ${number(Math.hypot(...force), 4)} mN: ${parts}` : "";
   }
 
   function showCut() {

@@ -64,7 +64,7 @@ document.querySelectorAll(".views canvas").forEach((canvas, number) => {
   } else {
     const note = document.createElement("p");
     note.className = "failure";
-    note.textContent = "This browser has no WebGL 2, so the 3-D view cannot be shown; see the cutaway picture.";
+    note.textContent = "This browser does not support WebGL 2, so the 3-D view cannot be shown; see the cutaway picture.";
     canvas.replaceWith(note);
   }
 });
