@@ -237,9 +237,9 @@ def test_awkward_names():
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (sample_model(2), "tetrahedra, got triangles"),
+        (sample_model(2), "tetrahedral mesh, got triangles"),
         (sample_model()._replace(materials=None, loads=()), "needs a material"),
-        (sample_model()._replace(cell_data={"v": np.zeros(3)}), 'is called "v"'),
+        (sample_model()._replace(cell_data={"v": np.zeros(3)}), 'needs the name "v"'),
     ],
 )
 def test_what_it_cannot_carry(model, message):

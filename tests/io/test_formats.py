@@ -172,7 +172,7 @@ def test_two_names_never_become_one():
     data |= {"pair": np.column_stack([values, values]), "pair_1": values + 4}
     long = {300 * "é" + str(k): values + k for k in range(3)}
     model = sample_model()._replace(cell_data=data | long, loads=())
-    with pytest.warns(UserWarning, match=r"called a\\n_2"):
+    with pytest.warns(UserWarning, match=r"support: a\\n_2"):
         columns = set(re.findall(r'<ElementData name="([^"]*)"', file_bytes(Path("a.feb"), model).decode()))
     assert len(columns) == 10
 

@@ -100,8 +100,8 @@ def test_a_background_without_a_colour_has_none(tmp_path):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "found none"),
-        ("# only a comment\n\n", "found none"),
+        ("", "found no lines"),
+        ("# only a comment\n\n", "found no lines"),
         ("spleen\n", r'line 1: expected a label table .* got "spleen"'),
         ("1,spleen\n", r'line 1: expected a label table .* a row of column names with "label"'),
         ("label,colour\n1,#ffffff\n", "a row of column names"),
@@ -134,7 +134,7 @@ def test_what_is_refused(tmp_path, text, match):
 def test_other_files(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_label_table(tmp_path / "none.txt")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="got a folder"):
         load_label_table(tmp_path)
     for encoding in ("latin-1", "utf-16"):
         with pytest.raises(InputError, match="expected UTF-8 text"):

@@ -432,13 +432,13 @@ def assert_refused(capfd, caplog):
 
 def test_a_missing_file(tmp_path, assert_refused):
     assert_refused(tmp_path / "no.vtu", "no such file")
-    assert_refused(tmp_path, "no such file")
+    assert_refused(tmp_path, "got a folder")
 
 
 @pytest.mark.parametrize("name", ["a.stl", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"named \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2$")
+    assert_refused(tmp_path / name, r"expected a \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2 mesh$")
 
 
 @pytest.mark.deep

@@ -267,7 +267,7 @@ def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
     ("options", "match"),
     [
         ({}, r"2 volumes along c \(2\); choose one from 0 to 1"),
-        ({"volume": 2}, "volume 2 asked for"),
+        ({"volume": 2}, "got 2: the file has 2 volumes"),
         ({"volume": 0, "crop": [(0, 9), (0, 1), (0, 1)]}, "crop: expected 0 <= start"),
         ({"volume": 0, "crop": [(0, 1)]}, "crop: expected 3 ranges"),
         ({"volume": 0, "slice_": (3, 1)}, "slice: expected axis 0"),
