@@ -424,7 +424,7 @@ BAD_OPTIONS = [
     ("--shape-power 0.5", "--shape-power: expected 1"),
     ("--retessellate always", "--retessellate"),
     ("--slice z", 'slice: expected .* got "z"'),
-    ("--slice k=99", "slice: index along axis 2 must be from 0 to 15, got 99"),
+    ("--slice k=99", "slice: expected an index from 0 to 15 along axis 2, got 99"),
     ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
     ("--crop 0:99,:,:", "crop"),
     ("--volume 1", "volume 1 asked for"),
@@ -449,10 +449,10 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc} -o a.vtu --lattice bcc", "expected one of criss-cross in 2-D"),
         ("mesh {disc} -o a.vtu --slice k=3", "slice"),
         ("mesh {disc} -o a.vtu --crop 1:5,1:5,1:5", "crop"),
-        ("mesh {disc} -o a.obj", "unknown suffix; known are .vtu"),
+        ("mesh {disc} -o a.obj", "unknown suffix; known suffixes are .vtu"),
         ("mesh {disc}", "--output"),
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
-        ("mesh {lattice} -o a.vtu", "unknown kind of image"),
+        ("mesh {lattice} -o a.vtu", "unknown image format"),
         ("quality no.vtu", "no such file"),
         ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
@@ -482,7 +482,7 @@ def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
     for name in ("a.nii", "b.nii", "a.json"):
         (tmp_path / name).write_text("old")
     new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert_refused(capfd, mesh, "a.json: exists already; pass --force")
+    assert_refused(capfd, mesh, "a.json: already exists; pass --force")
     assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
     assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
     assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
@@ -826,7 +826,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("a file")
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: the folder for the results cannot be made")
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: cannot create the folder for the results")
     assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
     names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert {each.name for each in (tmp_path / "new" / "deep").iterdir()} == names
@@ -895,7 +895,7 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     sizes = tetopt.Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
     assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
-    line = f"edges over their target size: {met['mean']:.2f} in the mean; {met['below']:.1%} under 0.71"
+    line = f"ratio of edges to their target size: {met['mean']:.2f} on average; {met['below']:.1%} are below 0.71"
     assert line in capfd.readouterr().out
     assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
     numbers = numbers_in(tmp_path / "a.json")

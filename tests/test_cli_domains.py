@@ -121,7 +121,7 @@ def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, ca
     assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
     assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
     names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
-    assert f'no set of facets "top"; there are {names}' in " ".join(capsys.readouterr().err.split())
+    assert f'no set of facets "top"; known sets are {names}' in " ".join(capsys.readouterr().err.split())
 
 
 def test_measured_again(run, inputs, tmp_path, capsys):
@@ -141,7 +141,7 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert [each["labels"] for each in again["contacts"]] == [each["labels"] for each in first["contacts"]]
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
-    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact over 1.2 times the"):
+    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact beyond 1.2 times that"):
         assert words in said
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
@@ -287,7 +287,7 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     command = ["mesh", inputs / "image.nii.gz", "--uniform", "--nodes", "300", "--iterations", "0"]
     command += ["-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--mask"]
     assert exit_code(*command, tmp_path / "four.nii.gz") == 2
-    assert "the file holds 2 volumes; choose one, 0 to 1" in capsys.readouterr().err
+    assert "the file has 2 volumes; choose one from 0 to 1" in capsys.readouterr().err
     assert exit_code(*command, f"{tmp_path / 'four.nii.gz'}:1") == 0
     assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data.sum()
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
@@ -335,4 +335,4 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         said = capsys.readouterr()
         assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
-        assert "one of them is not there" in said.out
+        assert "one of them is missing" in said.out

@@ -158,9 +158,9 @@ def test_surface_and_view_by_name(folder, tmp_path):
 def test_what_is_refused(folder, tmp_path, capsys):
     mesh, out, names = folder / "named.vtu", tmp_path / "a.vtu", ["--label-names", folder / "t.csv"]
     said = refused(capsys, "convert", mesh, out, "--young", "bright ball=5,*=20")
-    assert 'label "bright ball": no label is called so; did you mean bright_ball_e' in said
+    assert 'label "bright ball": no label has this name; did you mean bright_ball_e' in said
     said = refused(capsys, "convert", folder / "plain.vtu", out, "--young", "liver=5,*=20")
-    assert "no label has a name; give a table of them (--label-names)" in said
+    assert "labels have no names; give a table of names (--label-names)" in said
     said = refused(capsys, "surface", mesh, "-o", tmp_path / "a.stl", "--label", "spleen")
     assert "no cell has label 9 (spleen); the mesh has 0 (soft tissue), 1 (bright/ball [é])" in said
     said = refused(capsys, "convert", mesh, out, "--young", "5", "--load", "hold:interface_soft_tissue_bright_ball")

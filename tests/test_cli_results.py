@@ -86,7 +86,7 @@ def test_refusals_write_nothing(folder, capsys):
     refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
     (folder / "c.vtu").write_bytes((folder / "a.frd").read_bytes())
-    refused("is an input of this command", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
+    refused("is also an input", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
 
 
 def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(folder, order, capsys):

@@ -92,7 +92,7 @@ def test_a_limit_counts_what_there_is(monkeypatch):
         budget.check_memory(1001, "a", "b")
     budget.check_memory(600, "a", "b", limit=1000)
     with pytest.raises(
-        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in all, 0\.001 MB are allowed; b$"
+        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in total, 0\.001 MB are allowed; b$"
     ):
         budget.check_memory(601, "a", "b", limit=1000)
     assert not budget.MemoryLimit(1000, 600).is_reached()
@@ -140,7 +140,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
     words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force")
     assert exit_code(*words, "--max-gb", "0.001") == 2
-    assert "GB of memory in all, 1 MB are allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
+    assert "GB of memory in total, 1 MB are allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
         "\n", " "
     )
     assert not (tmp_path / "a.vtu").exists()
@@ -176,7 +176,7 @@ def test_a_limit_that_libraries_cannot_live_with_is_said(tmp_path, megabytes):
     words = [sys.executable, "-c", program, "mesh", str(tmp_path / "a.nii.gz"), "-o", str(tmp_path / "a.vtu")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "numba and the other libraries need 1.2 GB; raise it (ulimit -v" in done.stderr
+    assert "numba and other libraries need 1.2 GB; raise the limit (ulimit -v" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     done = subprocess.run([*words[:3], "--version"], capture_output=True, text=True, check=False)
     assert done.returncode == 0

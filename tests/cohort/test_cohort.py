@@ -272,7 +272,7 @@ def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
 
     monkeypatch.setattr(cohort_module, "subjects_of", fail)
     with locked(small / "out"):
-        assert "another run writes there" in refused(small, capsys)[0]
+        assert "another run is writing there" in refused(small, capsys)[0]
 
 
 def test_the_table_of_what_would_be_run(small, capsys):

@@ -187,7 +187,7 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
     made = document(copied(text, tmp_path / "a.html", FRAMES, BARS))
     lowest, highest, left, right = re.findall(r'<p class="said">([^<]*)</p>', made)
     assert re.fullmatch(r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest)
-    assert re.fullmatch(r"1.\d+ l and more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
+    assert re.fullmatch(r"1.\d+ l or more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
     assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
     assert right == "≥ " + highest[: highest.index(" and")]
 

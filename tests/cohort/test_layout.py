@@ -76,7 +76,7 @@ def locks(out, keys):
     code = "import sys; from pathlib import Path; from tetopt.cohort.layout import locked\n"
     code += "with locked(Path(sys.argv[1]), eval(sys.argv[2])): pass"
     done = subprocess.run([sys.executable, "-c", code, str(out), repr(keys)], capture_output=True, text=True)
-    assert done.returncode == 0 or "another run writes there (process" in done.stderr, done.stderr
+    assert done.returncode == 0 or "another run is writing there (process" in done.stderr, done.stderr
     return done.returncode == 0
 
 

@@ -110,7 +110,7 @@ def test_sizes_of_labels_in_a_file(tmp_path):
         ("fluid,thin", 'sizes.csv: label_size: expected mm, .* got "thin"'),
         ("fluid,1.5\nbrain,2", 'sizes.csv: label_size: no label has the name "brain"; fluid, bone'),
         ("fluid,1.5\n3,2", "sizes.csv: label_size: label 3 has two sizes"),
-        ("fluid", 'sizes.csv: expected rows of a name and what it has, got "fluid"'),
+        ("fluid", 'sizes.csv: expected rows of a name and values, got "fluid"'),
         ("", "sizes.csv: label_size: expected"),
     ):
         file.write_text(text)

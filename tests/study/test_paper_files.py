@@ -238,7 +238,7 @@ def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     assert (grid.cell_data["young"][0] > 0).all()
     assert grid.cell_data["strain"][0].shape == (len(grid.cells[0].data), 9)
     assert main(["fem", a, mesh, *box, "-o", mesh, "--force"]) == 2
-    assert "is an input of this command too" in capsys.readouterr().err
+    assert "is also an input" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])
