@@ -61,7 +61,7 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}" in said
     if more:
         assert "3 materials" in said or "6 materials" in said or "4 materials" in said
-        assert "off by" in said
+        assert "modulus error" in said
         assert "dark_surface" in said
     assert list(tmp_path.rglob("*")) == [out]
     assert exit_code("convert", folder / "a.vtu", out) == 2  # is there already

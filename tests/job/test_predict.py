@@ -51,7 +51,7 @@ def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli_predict, "available_bytes", lambda: 1000)
     assert exit_code(*words[:2], "-o", tmp_path / "a.vtu", "--target-error", "0.5", "--predict") == 0
     said = capsys.readouterr()
-    assert "of 4 runs with 5000 nodes" in said.out
+    assert "assuming 4 runs with 5000 nodes" in said.out
     assert "only 0.001 MB of memory is free, less than this run takes" in said.err.replace("\n", " ")
 
 

@@ -170,7 +170,7 @@ class SizeOptions:
         float | None, Option("MM", "Target edge length: longer edges are split while nodes remain.")
     ] = None
     edge_max: Annotated[
-        float | None, Option("MM", "Maximum edge length (default 1.4 x a uniform mesh's; none with `edge_size`).")
+        float | None, Option("MM", "Maximum edge length (default 1.4 x a uniform mesh's; with `edge_size` none).")
     ] = None
     gradation: Annotated[
         float | None, Option("G", "Gradation of sizes: each spans 1/G blocks, 0.05 (gentle) to 1 (default).")
@@ -218,7 +218,7 @@ class EngineOptions:
         float | None,
         Option(
             "K",
-            "Weight of the image: 0 for shape only, 0.9 for mainly the image "
+            "Weight of the image: 0 shape only; 0.9 image first "
             f"(default {GRADED_K_D:g}; `uniform` {UNIFORM_K_D:g}; `start` {START_K_D:g}).",
         ),
     ] = None
@@ -232,7 +232,7 @@ class EngineOptions:
         ),
     ] = None
     boundary: Annotated[
-        Boundary | None, Option(None, "Motion of boundary nodes (default slide; fixed with `start`).")
+        Boundary | None, Option(None, "Motion of boundary nodes (default slide; with `start` fixed).")
     ] = None
     method: Annotated[
         Method, Option(None, "fast: gradients, flips, a minimum dihedral angle; paper: the paper's scheme.")
@@ -267,7 +267,7 @@ class EngineOptions:
 
 
 WorkersOption = Annotated[
-    int | None, Option("N", "Maximum number of tasks at a time, or of a `cluster`'s jobs.", least=1)
+    int | None, Option("N", "Maximum number of tasks, or of a `cluster`'s jobs, at a time.", least=1)
 ]
 SchedulerOption = Annotated[
     str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
