@@ -28,8 +28,8 @@ def test_equal_pairs_are_one_material():
         ([1.0, 0.0, 2.0], 0.3, "above 0 kPa, got 1 invalid values, the first 0 in cell 1"),
         ([1.0, np.nan, 2.0], 0.3, "above 0 kPa"),
         ([1.0, np.inf, 2.0], 0.3, "above 0 kPa"),
-        (1.0, 0.5, "-1 < nu < 0.5, got 3 cells"),
-        (1.0, [0.3, -1.0, 0.3], "got 1 invalid cells, the first -1 in cell 1"),
+        (1.0, 0.5, "-1 < nu < 0.5, got others in 3 cells"),
+        (1.0, [0.3, -1.0, 0.3], "got others in 1 cells, the first -1 in cell 1"),
         (1.0, [0.3, np.nan, 0.3], "-1 < nu < 0.5"),
         ([1.0, 2.0], 0.3, "expected one value for each of 3 cells"),
     ],
@@ -161,7 +161,7 @@ def test_ratios_may_be_negative_and_mappings():
         build_model(mesh, image, young=2.0, nu="1 / h")
     with pytest.raises(InputError, match="expected 0 kPa or more"):
         build_model(mesh, image, young="h - 10")
-    with pytest.raises(InputError, match="the mesh has no means"):
+    with pytest.raises(InputError, match="the mesh has no cell means"):
         build_model(mesh, young="h")
 
 
@@ -195,7 +195,7 @@ def test_cells_of_another_density_are_of_another_material():
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
 def test_densities_that_are_none(wrong):
-    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got 1 invalid cells"):
+    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got others in 1 cells"):
         materials(1.0, 0.3, 2, [1000.0, wrong])
     with pytest.raises(InputError, match="gravity: the cells have no density; give `density`"):
         density_of(materials(1.0, 0.3, 2))

@@ -154,7 +154,7 @@ def test_labels_from_a_file(tmp_path):
         ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
         ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
         ("a.csv", "intensity;young\n1;2,1\n", "write 2.1 for 2,1"),
-        ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
+        ("a.csv", "intensity,young\n1,nan\n", "expected finite"),
         ("a.csv", "label,young\n1,2\n1,3\n", "label 1 has two values"),
         ("a.csv", "label,young\n1.5,2\n", "columns of numbers"),
         ("a.csv", "label,young,young\n1,2,3\n", "each column once"),

@@ -235,7 +235,7 @@ def test_words_that_are_refused(text, match):
 
 def test_a_surface_takes_its_name_too():
     model = sample_model(3)
-    with pytest.raises(InputError, match='"dark_surface" already'):
+    with pytest.raises(InputError, match='"dark_surface" exists already'):
         with_requested(
             model.mesh,
             Sets({"dark_surface": boundary_rows(model.mesh)}, {}),
@@ -246,7 +246,7 @@ def test_a_surface_takes_its_name_too():
 
 def test_below_needs_means():
     mesh = sample_model(3).mesh
-    with pytest.raises(InputError, match="has no means"):
+    with pytest.raises(InputError, match="has no cell means"):
         with_requested(mesh, Sets({}, {}), ["dark=below:12"], None)
 
 

@@ -53,7 +53,7 @@ def test_suffix_of_any_case(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a", "nii", "a.gz", "a.nii.gz.part"])
 def test_other_suffixes_are_refused(tmp_path, name):
-    assert_refused(tmp_path / name, "ends in .nii or .nii.gz", NIFTI, force=True)
+    assert_refused(tmp_path / name, "ending in .nii or .nii.gz", NIFTI, force=True)
 
 
 def test_an_existing_file_is_refused_without_force(tmp_path):

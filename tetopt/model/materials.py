@@ -97,7 +97,7 @@ def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike 
     outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
     if len(outside):
         raise InputError(
-            f"nu: expected -1 < nu < 0.5, got {len(outside)} invalid cells, the first {columns[1][outside[0]]:g} "
+            f"nu: expected -1 < nu < 0.5, got others in {len(outside)} cells, the first {columns[1][outside[0]]:g} "
             f"in cell {outside[0]}; for nearly incompressible tissue use 0.45 to 0.49"
         )
     if density is not None:
@@ -112,7 +112,7 @@ def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
     bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
     if len(bad):
         raise InputError(
-            f"density: expected kg/m3 above 0, got {len(bad)} invalid cells, the first {density[bad[0]]:g} in cell "
+            f"density: expected kg/m3 above 0, got others in {len(bad)} cells, the first {density[bad[0]]:g} in cell "
             f"{bad[0]}; water has 1000"
         )
     return density
