@@ -972,7 +972,7 @@ def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
     assert exit_code(*command, "--truth", tmp_path / "other.nii") == 2
     assert "expected labels on the image's grid" in capfd.readouterr().err
     assert exit_code(*command, "--classes", "300") == 2
-    assert "classes: 300 asked for" in capfd.readouterr().err
+    assert "classes: 300 requested" in capfd.readouterr().err
     assert not (tmp_path / "l.nii").exists()
 
 

@@ -125,10 +125,10 @@ def test_fortran_order_and_negative_strides_are_read_right():
         (np.zeros(5), "expected 2 or 3 axes"),
         (np.float64(3), "expected 2 or 3 axes"),
         (np.zeros((2, 2, 2, 2)), "expected 2 or 3 axes"),
-        (np.zeros((3, 0)), "every axis needs a voxel"),
+        (np.zeros((3, 0)), "at least one voxel along every axis"),
         (np.zeros((2, 2), dtype=complex), "magnitude"),
         (np.zeros((2, 2), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]), "RGB"),
-        (np.array([[None, 1], [2, 3]]), "one number a voxel"),
+        (np.array([[None, 1], [2, 3]]), "one number per voxel"),
         (np.array([["a", "b"]]), "expected numbers"),
         (np.array([["2020-01-01"]], dtype="M8[D]"), "expected numbers"),
     ],
@@ -178,7 +178,7 @@ def test_intensities_whose_squares_can_be_summed(factor):
 
 @pytest.mark.parametrize("values", [(0.0, 1e-300), (0.0, 1e300), (-1e200, 0.0), (5e-324, 0.0), (1e300, 1e300)])
 def test_intensities_whose_squares_cannot_be_summed(values):
-    with pytest.raises(InputError, match=r"intensities up to 1e\+148 that differ by 1e-152 at least, .*scale"):
+    with pytest.raises(InputError, match=r"intensities up to 1e\+148 that differ by at least 1e-152, .*rescale"):
         Image(np.array([values]))
 
 

@@ -103,16 +103,16 @@ IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(f
 LATTICE = tetopt.lattice_mesh(IMAGE, blocks=(2, 2, 2))
 LIMITS, CHANNELS = _block_limits(plain(IMAGE), 100, None), channels_of(plain(IMAGE))
 TASKS = {
-    "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
+    "lattice: .* nodes: needs.*use fewer": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
         plain(IMAGE), CHANNELS, (4, 4, 4), LIMITS
     ),
-    "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
-    "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
+    "phantom 'sphere': .* voxels: needs.*use larger": lambda: tetopt.load_phantom("sphere").image(),
+    "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop the image": lambda: sampling_grid(IMAGE, LATTICE.points),
     "labels: 3 labels on 1512 .*division by 1 x 1 x 3.*: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
-    "elasticity: the stiffness of .* cells of 10 nodes: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
+    "elasticity: the stiffness of .* cells with 10 nodes each: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
     "reference: 2160 degrees of freedom: needs.*`reference_dofs`": lambda: reference(IMAGE, 0.3),
-    "^octree: 100 nodes: needs.*ask for fewer": lambda: tetopt.mesh_image(IMAGE, 100),
+    "^octree: 100 nodes: needs.*use fewer": lambda: tetopt.mesh_image(IMAGE, 100),
     "^an image of 9 x 8 x 7 voxels: needs.*`crop`": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
 }
 

@@ -717,7 +717,7 @@ def test_not_finite(tmp_path, bad):
 def test_empty_axis(tmp_path, shape):
     assert_refused(
         save_nifti(tmp_path / "a.nii", np.zeros(shape, np.int16)),
-        "every axis needs a voxel|expected voxels along every axis",
+        "at least one voxel along every|expected voxels along every axis",
     )
 
 

@@ -517,8 +517,8 @@ def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
     [
         ("0 1 2 3", "0", "1 of 1 are flat"),
         ("0 1 2 2", "1", "1 of 1 are flat"),
-        ("0 1 2 3", "nan", "must be finite, node 3"),
-        ("0 1 2 3", "inf", "must be finite, node 3"),
+        ("0 1 2 3", "nan", "expected finite coordinates, but node 3"),
+        ("0 1 2 3", "inf", "expected finite coordinates, but node 3"),
         ("0 1 2 7", "1", "nodes 0..7, it has 0..4"),
         ("0 1 2 -1", "1", "nodes -1..2, it has 0..4"),
         ("0 1 2", "1", "damaged"),
