@@ -1,9 +1,9 @@
-"""How fast tetopt is on this machine, in whole processes and beside other meshers; a table and a JSON file.
+"""Benchmark tetopt on this machine, in whole processes and beside other meshers; prints a table, writes JSON.
 
     python scripts/benchmark.py -o bench.json [IMAGE]
 
-IMAGE is the MNI152 T1 that nilearn carries unless another is named. Compare ratios within one run: absolute times
-depend on the machine and on what else it does. Kernels by themselves: `tests/benchmarks/benchmark_kernels.py`.
+IMAGE defaults to the MNI152 T1 from nilearn. Compare ratios within one run: absolute times depend on the machine and
+its load. For single kernels, see `tests/benchmarks/benchmark_kernels.py`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ HEAD_NODES = 130_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, write."""
+    """Run the benchmarks, print a table and write a JSON file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
-    parser.add_argument("--cgal", help="a program that meshes labels by CGAL's Mesh_3, see `peers`")
-    parser.add_argument("--cgal-sized", help="another, with sizes by place, see `head`")
+    parser.add_argument("--cgal", help="program that meshes labels with CGAL's Mesh_3, see `peers`")
+    parser.add_argument("--cgal-sized", help="the same with a sizing field, see `head`")
     parser.add_argument("--head", type=Path, help="labels of a whole head, see `head`")
-    parser.add_argument("--quick", action="store_true", help="small meshes, to try the script itself")
+    parser.add_argument("--quick", action="store_true", help="small meshes, to test the script itself")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
@@ -69,9 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def first_calls(nodes: int) -> dict[str, dict[str, float]]:
-    """Wall and CPU seconds of the first `tetopt mesh` of each kind with an empty cache of kernels, less the second's.
+    """Time the first `tetopt mesh` of each kind with an empty kernel cache, less the second: wall and CPU seconds.
 
-    Of a ball in 24^3 voxels; `again` is the second's wall time, of a whole process.
+    The image is a ball in 24^3 voxels; `again` is the wall time of the second process.
     """
     radius = np.sqrt(((np.indices((24, 24, 24)) - 11.5) ** 2).sum(axis=0))
     with tempfile.TemporaryDirectory() as name:
@@ -99,7 +99,7 @@ def first_calls(nodes: int) -> dict[str, dict[str, float]]:
 def process_seconds(
     command: Sequence[str], environment: dict[str, str] | None = None, allowed: Sequence[int] = (0,)
 ) -> tuple[float, float]:
-    """Wall and CPU seconds of a process and of those that it starts, which ends with one of the allowed codes."""
+    """Return the wall and CPU seconds of a process and its children; its exit code must be one of those allowed."""
     before, begin = os.times(), time.perf_counter()
     done = subprocess.run(command, env=environment, capture_output=True)
     if done.returncode not in allowed:
@@ -110,11 +110,11 @@ def process_seconds(
 
 
 def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any]:
-    """Whole processes in turns at about equal numbers of nodes, the least seconds of each: tetopt, pytetwild, CGAL.
+    """Time tetopt, pytetwild and CGAL in turns, at about equal numbers of nodes: the minimum over whole processes.
 
-    The others mesh the tissue labels that come with the MNI152 T1, or two classes of another image. CGAL is a program
-    `cgal LABELS.raw nx ny nz sx sy sz OUT.bin SIZE` that prints JSON with `nodes`, run alone at the size that gives
-    about as many nodes.
+    The others mesh the tissue labels of the MNI152 T1, or two classes of another image. CGAL is a program
+    `cgal LABELS.raw nx ny nz sx sy sz OUT.bin SIZE` that prints JSON with `nodes`; SIZE is chosen to give about the
+    same number of nodes.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -146,8 +146,8 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
 
 
 def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
-    """`_sized` of the program that takes one size."""
-    # Label 0 is left out by CGAL: all are raised by one. Padded by a voxel, so that the outer ones are meshed whole.
+    """Return `_sized` for the program with one cell size."""
+    # CGAL skips label 0, so all labels are raised by one. Padding by a voxel keeps the outer labels whole.
     raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")
     grid = _written(folder / "labels.raw", raised, labels)
 
@@ -158,13 +158,13 @@ def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) 
 
 
 def _written(path: Path, padded: NDArray, image: tetopt.Image) -> list[str]:
-    """The words by which CGAL's programs are told the grid of voxels, which are written as they read them."""
+    """Write voxels in the order that CGAL's programs read; return the arguments that describe their grid."""
     padded.transpose(2, 1, 0).tofile(path)
     return [*map(str, padded.shape), *map(str, image.spacing)]
 
 
 def _sized(command: Callable[[float], list[str]], size: float, nodes: int) -> tuple[list[str], int]:
-    """The command of the size that gives about so many nodes, and how many those are; at most six runs to find it."""
+    """Return the command whose size gives about `nodes` nodes, and their number; searches in at most six runs."""
     for _ in range(6):
         words = command(size)
         done = subprocess.run(words, check=True, capture_output=True, text=True)
@@ -176,7 +176,7 @@ def _sized(command: Callable[[float], list[str]], size: float, nodes: int) -> tu
 
 
 def labelled(path: Path, nodes: int) -> dict[str, Any]:
-    """The whole process with the tissues as labels, within them, and without, in turns: the least of two each."""
+    """Time the whole process with tissues as labels and background removed, and without, in turns: minimum of two."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tetopt.save_image(folder / "labels.nii.gz", _tissues(path))
@@ -189,7 +189,7 @@ def labelled(path: Path, nodes: int) -> dict[str, Any]:
 
 
 def masked_start(path: Path, nodes: int) -> dict[str, Any]:
-    """The octree within a mask and a field of sizes, in a process of its own: seconds, memory."""
+    """Measure seconds and memory of the octree within a mask and a sizing field, in its own process."""
     program = (
         "import json, resource, sys, time, numpy as np, tetopt\n"
         "image, mask, nodes = tetopt.load_image(sys.argv[1]), tetopt.load_image(sys.argv[2]), int(sys.argv[3])\n"
@@ -211,7 +211,7 @@ def masked_start(path: Path, nodes: int) -> dict[str, Any]:
 
 
 def stopped(seconds: float) -> dict[str, float]:
-    """Labels within a mask, slabs of 575 voxels, cells far below them, to be stopped: the seconds that each takes."""
+    """Time runs with a time limit: labels in a mask, slabs of 575 voxels, and cells far smaller than voxels."""
     rows = {}
     for shape, nodes in (((1, 5, 115), 30_000), ((5, 23, 5), 10_000)):
         image = tetopt.Image(np.random.default_rng(0).integers(0, 1000, shape).astype(float))
@@ -227,11 +227,11 @@ def stopped(seconds: float) -> dict[str, float]:
 
 
 def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
-    """A head of five tissues within its mask, by the command of docs/measured/labels.md, and CGAL's after it.
+    """Time a head of five tissues within its mask, with the command of docs/measured/labels.md, and then CGAL.
 
     CGAL is a program `cgal LABELS.raw SIZES.raw nx ny nz sx sy sz OUT.bin 1` that perturbs and exudes, and prints JSON
-    with `nodes`; its sizes are those that tetopt asks for by tissue and thickness, times a factor that gives about as
-    many nodes.
+    with `nodes`; its sizes are tetopt's target sizes by tissue and thickness, times a factor that gives about the same
+    number of nodes.
     """
     image, words = tetopt.load_image(path), "1=0.7t[1:4],2=0.9t[1.5:6],3=1t[1.2:6],4=1.3t[1.5:7],*=1t[2:10]"
     with tempfile.TemporaryDirectory() as name:
@@ -239,7 +239,7 @@ def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
         out = folder / "out.vtu"
         command = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(out), "--labels", str(path)]
         command += ["--background", "0", "--size-min", "1", "--nodes", str(nodes), "--label-size", words]
-        # A mesh that violates a requirement, exit code 1, is timed like any other, and the row says which.
+        # A mesh that violates a requirement (exit code 1) is timed like any other; the row names the requirement.
         wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"], allowed=(0, 1))
         run = json.loads((folder / "run.json").read_text())
         rows = {"nodes": nodes, "cells": len(tetopt.load_mesh(out).mesh.cells), "wall": wall, "cpu": cpu}
@@ -261,7 +261,7 @@ def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
 
 
 def _tissues(path: Path) -> tetopt.Image:
-    """The tissue labels that come with the MNI152 T1, or two classes of another image."""
+    """Return the tissue labels of the MNI152 T1, or two classes of another image."""
     if path.name == mni_path("t1").name:
         return mni_tissue()
     image = tetopt.load_image(path)
@@ -269,9 +269,9 @@ def _tissues(path: Path) -> tetopt.Image:
 
 
 def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
-    """`tetopt.mesh_image` with its defaults, the second time in a process of its own: time, shape, fidelity, memory.
+    """Measure the second `tetopt.mesh_image` of a new process, with defaults: time, shape, fidelity, memory.
 
-    Of the volume as it is, or of `edge`^3 voxels, padded by zeros and cut.
+    The image is the whole volume, or `edge`^3 voxels of it, zero-padded and cropped.
     """
     program = (
         "import json, resource, sys, time, numpy as np, tetopt\n"
@@ -294,13 +294,13 @@ def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
 
 
 def _told_by(program: str, *words: object) -> dict[str, Any]:
-    """The JSON in the last line that a program prints, in a process of its own."""
+    """Run a program in its own process; return the JSON in the last line that it prints."""
     command = [sys.executable, "-c", program, *map(str, words)]
     return json.loads(subprocess.run(command, check=True, capture_output=True).stdout.splitlines()[-1])
 
 
 def show(rows: dict[str, Any]) -> None:
-    """Print the table."""
+    """Print the results as a table."""
     print(f"{rows['image']}, {rows['cores']} cores")
     for kind, seconds in rows["first_calls"].items():
         print(

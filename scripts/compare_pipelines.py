@@ -1,4 +1,4 @@
-"""Set tetopt beside the conventional pipelines; the same as `tetopt compare`.
+"""Compare tetopt with conventional pipelines; the same as `tetopt compare`.
 
 python scripts/compare_pipelines.py T1.nii.gz -o OUT
 """
@@ -12,7 +12,7 @@ from tetopt.cli import main as tetopt
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit code of ``tetopt compare`` with these arguments."""
+    """Run ``tetopt compare`` with these arguments; return its exit code."""
     return tetopt(["compare", *(sys.argv[1:] if argv is None else argv)])
 
 

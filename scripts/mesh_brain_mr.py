@@ -1,7 +1,7 @@
-"""From a brain MR volume to a mesh, its pictures and the ventricles, as in Fig. 3(e, f) of the paper.
+"""Mesh a brain MR volume, draw it and extract the ventricles, as in Fig. 3(e, f) of the paper.
 
 The structure is the largest facet-connected set of tetrahedra whose mean intensity is below a threshold. Sets that
-touch the box are left out: on a head with dark air around it they are the air.
+touch the box are excluded: they are the dark air around the head.
 
     python scripts/mesh_brain_mr.py T1.nii.gz -o OUT
 """
@@ -27,11 +27,11 @@ from tetopt.system.files import checked_output, save_json, written_whole
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the workflow; 0 when all is written, 2 with one line on an input to mend."""
+    """Run the workflow; return 0 on success, 2 after a one-line message about an invalid input."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("image", type=Path, help="T1-weighted volume, CSF dark")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the results")
-    parser.add_argument("--nodes", type=int, default=10_000, help="wanted number of nodes (%(default)s)")
+    parser.add_argument("--nodes", type=int, default=10_000, help="target number of nodes (%(default)s)")
     parser.add_argument("--k-d", type=float, default=0.3, help="weight of the image (%(default)s)")
     parser.add_argument("--iterations", type=int, default=15, help="sweeps over all nodes (%(default)s)")
     parser.add_argument("--below", type=float, help="threshold; default: 0.7 x the median of the brighter half")
@@ -81,9 +81,9 @@ def _run(options: argparse.Namespace) -> int:
     save_json(json_path, summary)
     print(f"structure below {below:.4g}: {len(structure)} tets, {volume:.0f} mm^3; all in {folder}")
     if pinches:
-        print(f"note: {pinches} edges of its surface lie in more than two facets, where tets touch along an edge only")
+        print(f"note: {pinches} edges of its surface lie in more than two facets, where tets touch only along an edge")
     if len(structure) < 10:
-        print("note: that is hardly a structure; look at structure.png and choose --below")
+        print("note: the structure is very small; look at structure.png and adjust --below")
     return 0
 
 
@@ -92,12 +92,12 @@ def _say(row: IterationRecord) -> None:
 
 
 def _default_threshold(image: tetopt.Image) -> float:
-    """0.7 x the median of the voxels brighter than the mean: between CSF and grey matter on a T1."""
+    """Return 0.7 x the median of the voxels brighter than the mean: between CSF and grey matter on a T1."""
     return 0.7 * float(np.median(image.data[image.data > image.data.mean()]))
 
 
 def inner_structure(mesh: tetopt.Mesh, is_chosen: np.ndarray) -> np.ndarray:
-    """Cells of the largest connected set among the chosen that does not touch the mesh's boundary, ascending."""
+    """Return the cells, ascending, of the largest connected set of chosen cells that does not touch the boundary."""
     chosen = np.flatnonzero(is_chosen)
     if len(chosen) == 0:
         raise tetopt.InputError("no cell is below the threshold; raise --below")

@@ -1,4 +1,4 @@
-"""Run the paper's figures and table again; the same as `tetopt paper`.
+"""Reproduce the paper's figures and table; the same as `tetopt paper`.
 
 python scripts/reproduce_paper.py -o OUT
 """
@@ -12,7 +12,7 @@ from tetopt.cli import main as tetopt
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit code of ``tetopt paper`` with these arguments."""
+    """Run ``tetopt paper`` with these arguments; return its exit code."""
     return tetopt(["paper", *(sys.argv[1:] if argv is None else argv)])
 
 

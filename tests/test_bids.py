@@ -58,18 +58,18 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
     with locked(out, ["sub-02"]):
         options = ["--nodes", "60", "--iterations", "1"]
         assert main([str(raw), str(out), "participant", "--participant_label", "02", *options]) == 2
-        assert "sub-02: another run writes there" in capsys.readouterr().err
+        assert "sub-02: another run is writing there" in capsys.readouterr().err
         assert main([str(raw), str(out), "participant", "--participant_label", "01", *options]) == 0
         capsys.readouterr()
         assert main([str(raw), str(out), "group"]) == 2
-        assert "another run writes there" in capsys.readouterr().err
+        assert "another run is writing there" in capsys.readouterr().err
     (out / "cohort.tsv").unlink()
     assert main([str(raw), str(out), "group"]) == 1
     assert "1 done, 1 not run" in capsys.readouterr().out
     assert [line.split("\t")[0] for line in (out / "cohort.tsv").read_text().splitlines()[1:]] == ["sub-01", "sub-02"]
     assert (out / "sub-01" / "sub-01_desc-tetopt_mesh.vtu").exists()
     assert main([str(raw), str(out), "group", "--dry-run"]) == 2
-    assert "--collect runs nothing" in capsys.readouterr().err
+    assert "--collect: runs nothing" in capsys.readouterr().err
 
 
 def test_help_and_version(capsys):

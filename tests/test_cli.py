@@ -234,8 +234,8 @@ def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, input
     first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["octree", "optimised"]
     assert table["E, combined"] == ["1.0000", f"{numbers['energies']['E']:.4f}"]
-    assert table["E_D, of initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
-    assert table["E_G, of initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
+    assert table["E_D, relative to initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
+    assert table["E_G, relative to initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
     assert table["rho, smallest"] == [f"{first['min_rho']:.4f}", f"{last['min_rho']:.4f}"]
     assert table["smallest angle, degrees"] == [f"{first['min_dihedral']:.2f}", f"{last['min_dihedral']:.2f}"]
     assert table["rho, smallest"][0] != table["rho, smallest"][1]
@@ -385,8 +385,8 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines()[-3:] == [
-        "interrupted: finishing the current nodes, then writing the mesh (again to give up)",
-        "interrupted again: what is not yet written is given up",
+        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to discard it)",
+        "interrupted again: unwritten results are discarded",
         "ended by Ctrl-C; written: nothing",
     ]
     assert list(tmp_path.iterdir()) == []
@@ -424,7 +424,7 @@ BAD_OPTIONS = [
     ("--shape-power 0.5", "--shape-power: expected 1"),
     ("--retessellate always", "--retessellate"),
     ("--slice z", 'slice: expected .* got "z"'),
-    ("--slice k=99", "slice: index along axis 2 must be from 0 to 15, got 99"),
+    ("--slice k=99", "slice: expected an index from 0 to 15 along axis 2, got 99"),
     ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
     ("--crop 0:99,:,:", "crop"),
     ("--volume 1", "volume 1 asked for"),
@@ -449,10 +449,10 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc} -o a.vtu --lattice bcc", "expected one of criss-cross in 2-D"),
         ("mesh {disc} -o a.vtu --slice k=3", "slice"),
         ("mesh {disc} -o a.vtu --crop 1:5,1:5,1:5", "crop"),
-        ("mesh {disc} -o a.obj", "unknown suffix; known are .vtu"),
+        ("mesh {disc} -o a.obj", "unknown suffix; known suffixes are .vtu"),
         ("mesh {disc}", "--output"),
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
-        ("mesh {lattice} -o a.vtu", "unknown kind of image"),
+        ("mesh {lattice} -o a.vtu", "unknown image format"),
         ("quality no.vtu", "no such file"),
         ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
@@ -482,7 +482,7 @@ def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
     for name in ("a.nii", "b.nii", "a.json"):
         (tmp_path / name).write_text("old")
     new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert_refused(capfd, mesh, "a.json: exists already; pass --force")
+    assert_refused(capfd, mesh, "a.json: already exists; pass --force")
     assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
     assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
     assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
@@ -541,8 +541,8 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 6, "What is meshed": 13, "Number and size of cells": 9, "The mesh it begins with": 4,
-        "Optimisation": 11, "Beyond one memory": 5, "For the solver": 13,
+        "Options": 6, "Region and labels": 13, "Number and size of cells": 9, "Initial mesh": 4,
+        "Optimisation": 11, "Meshing in parts": 5, "For the solver": 13,
     }  # fmt: skip
 
 
@@ -804,7 +804,7 @@ def test_quality_with_another_image(tmp_path, inputs, capsys):
     assert exit_code("quality", tmp_path / "a.vtu", "--image", inputs / "sphere.nii.gz") == 0
     assert capsys.readouterr().err == ""
     assert exit_code("quality", tmp_path / "a.vtu", "--image", tmp_path / "other.nii") == 0
-    assert "a.vtu was made from another image" in capsys.readouterr().err
+    assert "a.vtu was built from a different image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", [["--slice", "k=4"], ["--crop", "1:7,:,2:"]])
@@ -826,7 +826,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("a file")
     assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: the folder for the results cannot be made")
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: cannot create the folder for the results")
     assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
     names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert {each.name for each in (tmp_path / "new" / "deep").iterdir()} == names
@@ -836,7 +836,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     ("extra", "words"),
     [
         (["--method", "paper"], "only with --method fast"),
-        (["--spacing", "3"], "no one spacing"),
+        (["--spacing", "3"], "no single spacing"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
@@ -876,7 +876,7 @@ def test_octree_mesh(tmp_path, inputs, capsys):
 )
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
-    assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
+    assert_refused(capfd, command, f"{option.split()[0]}: needs a graded mesh")
 
 
 def test_mesh_with_limits(tmp_path, inputs, capfd):
@@ -895,7 +895,7 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     sizes = tetopt.Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
     assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
-    line = f"edges over their target size: {met['mean']:.2f} in the mean; {met['below']:.1%} under 0.71"
+    line = f"ratio of edges to their target size: {met['mean']:.2f} on average; {met['below']:.1%} are below 0.71"
     assert line in capfd.readouterr().out
     assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
     numbers = numbers_in(tmp_path / "a.json")
@@ -970,7 +970,7 @@ def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
     other = tetopt.load_phantom("sphere").label_image(voxel_mm=3.3)
     tetopt.save_image(tmp_path / "other.nii", other)
     assert exit_code(*command, "--truth", tmp_path / "other.nii") == 2
-    assert "expected labels on the image's own voxels" in capfd.readouterr().err
+    assert "expected labels on the image's grid" in capfd.readouterr().err
     assert exit_code(*command, "--classes", "300") == 2
     assert "classes: 300 requested" in capfd.readouterr().err
     assert not (tmp_path / "l.nii").exists()
@@ -1011,5 +1011,5 @@ def test_an_error_of_a_million_letters_is_cut(capsys):
 def test_a_former_name_is_refused_with_that_of_now(former, now, capsys):
     words = ["mesh", "a.nii", "-o", "a.vtu", "--" + former.replace("_", "-"), "9"]
     assert (exit_code(*words), f"(Possible options: --{now.replace('_', '-')})" in capsys.readouterr().err) == (2, True)
-    with pytest.raises(tetopt.InputError, match=f"has no option '{former}'; is {now} meant"):
+    with pytest.raises(tetopt.InputError, match=f"unknown option '{former}'; did you mean {now}"):
         tetopt.Job.from_json(json.dumps({former: 9}))

@@ -100,8 +100,8 @@ def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
     begun, octree, rest = capsys.readouterr().err.partition("octree of ")
     assert octree
     assert "reading and preparing the image" in begun
-    assert "making the initial mesh, " in begun
-    assert "making the initial mesh" not in rest
+    assert "building the initial mesh, " in begun
+    assert "building the initial mesh" not in rest
 
 
 def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, capsys):
@@ -121,7 +121,7 @@ def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, ca
     assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
     assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
     names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
-    assert f'no set of facets "top"; there are {names}' in " ".join(capsys.readouterr().err.split())
+    assert f'no set of facets "top"; known sets are {names}' in " ".join(capsys.readouterr().err.split())
 
 
 def test_measured_again(run, inputs, tmp_path, capsys):
@@ -141,7 +141,7 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert [each["labels"] for each in again["contacts"]] == [each["labels"] for each in first["contacts"]]
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
-    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact over 1.2 times the"):
+    for words in ("volume, mm3", "larger by, %", "Dice by volume", "in one layer, %", "contact beyond 1.2 times that"):
         assert words in said
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
@@ -166,9 +166,7 @@ def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, mor
     name = re.search("E_D, fraction of .* variance(?= )", said.out)[0]
     assert f"{name} " in judged.out
     assert f"{fraction:.5f}" in judged.out
-    assert re.findall("fraction of its own variance.*", said.out) == re.findall(
-        "fraction of its own variance.*", judged.out
-    )
+    assert re.findall("fraction of its variance.*", said.out) == re.findall("fraction of its variance.*", judged.out)
 
 
 def test_background(inputs, tmp_path, capsys):
@@ -193,7 +191,7 @@ def test_labels_alone(inputs, tmp_path, capsys):
     assert exit_code(*command, "--json", tmp_path / "a.json") == 0
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     captured = capsys.readouterr()
-    assert "only these count" in captured.err
+    assert "only these are used" in captured.err
     assert "E_D, fraction of the labels' variance" in captured.out
     assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
     first = re.search(r'"fields": \[\{"name": "(\w+)"', (tmp_path / "a.html").read_text())[1]
@@ -250,9 +248,9 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--mask", tmp_path / "half.nii.gz"]
     assert exit_code(*command, "--nodes", "300", "--iterations", "0", "-o", tmp_path / "a.vtu") in (0, 1)
     said = " ".join(capsys.readouterr().err.split())
-    assert "square.nii.gz: taken to the image's voxels, linearly" in said
-    assert "half.nii.gz: taken to the image's voxels, nearest neighbour" in said
-    assert "% of it lies in the image; is it of the same scan?" in said
+    assert "square.nii.gz: resampled to the image's grid (linear)" in said
+    assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
+    assert "% of it lies within the image; is it of the same scan?" in said
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
@@ -269,7 +267,7 @@ def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
 def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):
     """Without the mask at hand, too: the file says that there was one."""
     assert exit_code("quality", run / "mesh.vtu", "--image", inputs / "image.nii.gz", "--check") == 0
-    assert "checked: conforming, oriented; made within a mask" in capsys.readouterr().out
+    assert "checked: conforming, oriented; meshed within a mask" in capsys.readouterr().out
 
 
 def test_intensities_are_no_labels(inputs, tmp_path, capsys):
@@ -278,7 +276,7 @@ def test_intensities_are_no_labels(inputs, tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
     command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
     exit_code(*command)
-    assert "cells are too large for them, or these are no labels" in " ".join(capsys.readouterr().err.split())
+    assert "elements are too large for them, or this is not a label image" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
@@ -289,7 +287,7 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     command = ["mesh", inputs / "image.nii.gz", "--uniform", "--nodes", "300", "--iterations", "0"]
     command += ["-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--mask"]
     assert exit_code(*command, tmp_path / "four.nii.gz") == 2
-    assert "the file holds 2 volumes; choose one, 0 to 1" in capsys.readouterr().err
+    assert "the file has 2 volumes; choose one from 0 to 1" in capsys.readouterr().err
     assert exit_code(*command, f"{tmp_path / 'four.nii.gz'}:1") == 0
     assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data.sum()
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
@@ -300,14 +298,14 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     ("options", "match"),
     [
         ("--background dark", '--background: expected a number, got "dark"'),
-        ("--label-weight 2", "--label-weight: there are no --labels"),
+        ("--label-weight 2", "--label-weight: needs --labels"),
         ("--weights 1,2", "weights: expected one for each of 1 images, 0 or 0.001 to 1000, got"),
         ("--mask empty.nii.gz", "empty.nii.gz: "),
         ("--mask far.nii.gz", "far.nii.gz: "),
         ("--mask parts.nii.gz", "parts.nii.gz: expected a mask"),
         ("--labels half.nii.gz", "half.nii.gz: labels must be whole numbers"),
         ("--labels far.nii.gz", "far.nii.gz: "),
-        ("--method paper --mask mask.nii.gz", "--method paper: takes one IMAGE and its whole box"),
+        ("--method paper --mask mask.nii.gz", "--method paper: needs one IMAGE and its whole box"),
     ],
 )
 def test_refused(inputs, tmp_path, monkeypatch, capfd, options, match):
@@ -337,4 +335,4 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         said = capsys.readouterr()
         assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
-        assert "one of them is not there" in said.out
+        assert "one of them is missing" in said.out

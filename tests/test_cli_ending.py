@@ -142,7 +142,7 @@ def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, co
     if names == ["stdout"]:
         said = capsys.readouterr().err
         assert said.endswith(
-            "standard output: cannot be written: No space left on device; what was printed is incomplete\n"
+            "standard output: cannot be written: No space left on device; the printed output is incomplete\n"
         )
 
 
@@ -232,7 +232,7 @@ def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, err
             exit_code(*command)
     else:
         assert exit_code(*command) == 2
-    assert f"the optimised mesh is in {folder / 'a.vtu'}: go on from there" in capsys.readouterr().err
+    assert f"the optimised mesh is in {folder / 'a.vtu'}: continue from there" in capsys.readouterr().err
     assert tetopt.load_mesh(folder / "a.vtu").cell_data["mean"].max() > 0.0
 
 
@@ -279,7 +279,7 @@ def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, ca
     assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[-2:] == [
-        f"tetopt: {folder / 'a.json'}: No space left on device", f"written all the same: {folder / 'a.vtu'}"
+        f"tetopt: {folder / 'a.json'}: No space left on device", f"written before the error: {folder / 'a.vtu'}"
     ]  # fmt: skip
 
 
@@ -287,7 +287,7 @@ def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folde
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.meshing, "watched", None)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert "a.vtu: takes some 8640 bytes or more, 5000 are free; make room first" in capsys.readouterr().err
+    assert "a.vtu: needs at least 8640 bytes, 5000 are free; free some space first" in capsys.readouterr().err
 
 
 def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):

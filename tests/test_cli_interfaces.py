@@ -154,5 +154,5 @@ def test_one_label_has_no_interfaces(slabs, capsys):
     mesh = tetopt.load_mesh(slabs / "slabs.vtu").mesh
     tetopt.save_mesh(slabs / "one.vtu", mesh, {"label": np.ones(len(mesh.cells), dtype=int)})
     assert exit_code("surface", slabs / "one.vtu", "--interfaces", "-o", slabs / "x.ply") == 2
-    assert "all cells have one label, which has no interfaces" in capsys.readouterr().err
+    assert "all cells have one label, so there are no interfaces" in capsys.readouterr().err
     assert not (slabs / "x.ply").exists()

@@ -121,7 +121,7 @@ def test_an_improved_mesh_keeps_the_names(folder, tmp_path, capsys):
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
     assert loaded.label_table.names[9] == "spleen"
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
-    assert "not kept" not in capsys.readouterr().err
+    assert "dropped sets" not in capsys.readouterr().err
 
 
 def test_another_table_renames(folder, tmp_path):
@@ -158,23 +158,23 @@ def test_surface_and_view_by_name(folder, tmp_path):
 def test_what_is_refused(folder, tmp_path, capsys):
     mesh, out, names = folder / "named.vtu", tmp_path / "a.vtu", ["--label-names", folder / "t.csv"]
     said = refused(capsys, "convert", mesh, out, "--young", "bright ball=5,*=20")
-    assert 'label "bright ball": no label is called so; did you mean bright_ball_e' in said
+    assert 'label "bright ball": no label has this name; did you mean bright_ball_e' in said
     said = refused(capsys, "convert", folder / "plain.vtu", out, "--young", "liver=5,*=20")
-    assert "no label has a name; give a table of them (--label-names)" in said
+    assert "labels have no names; give a table of names (--label-names)" in said
     said = refused(capsys, "surface", mesh, "-o", tmp_path / "a.stl", "--label", "spleen")
-    assert "no cell has label 9 (spleen); there are 0 (soft tissue), 1 (bright/ball [é])" in said
+    assert "no cell has label 9 (spleen); the mesh has 0 (soft tissue), 1 (bright/ball [é])" in said
     said = refused(capsys, "convert", mesh, out, "--young", "5", "--load", "hold:interface_soft_tissue_bright_ball")
     assert f"did you mean {INTERFACE}?" in said
     other = "hold:interface_bright_ball_e_soft_tissue"
     assert f"did you mean {INTERFACE}?" in refused(capsys, "convert", mesh, out, "--young", "5", "--load", other)
     image, labels = folder / "a.nii.gz", ["--labels", folder / "l.nii.gz"]
     plan = ["mesh", image, "-o", out, "--spacing", "8", "--iterations", "0"]
-    assert "--label-names: there are no --labels" in refused(capsys, *plan, *names)
+    assert "--label-names: needs --labels" in refused(capsys, *plan, *names)
     said = refused(capsys, *plan, *labels, *names, "--young", "5", "--load", other)  # before the optimisation
     assert said.endswith(f"did you mean {INTERFACE}?\n")
     assert "did you mean spleen" in refused(capsys, *plan, *labels, *names, "--young", "splen=5,*=20")
-    assert "--label-names: there are no --labels" in refused(capsys, "quality", mesh, *names)
-    assert "--label-names: there are no --labels" in refused(capsys, "compare", image, "-o", tmp_path / "c", *names)
+    assert "--label-names: needs --labels" in refused(capsys, "quality", mesh, *names)
+    assert "--label-names: needs --labels" in refused(capsys, "compare", image, "-o", tmp_path / "c", *names)
     (tmp_path / "bad.csv").write_text("label,name\n1,a\n1,b\n")
     for words in (
         ["convert", mesh, out],
@@ -231,7 +231,7 @@ def test_sets_that_are_none(folder, tmp_path, capsys):
         capsys, "convert", mesh, tmp_path / "a.stl", "--sets", "all"
     )
     words = ["fem", mesh, "--young", "1", "--load", "compress:5%"]
-    assert "--sets: no file is written; give -o" in refused(capsys, *words, "--sets", "all")
+    assert "--sets: no file is written; add -o" in refused(capsys, *words, "--sets", "all")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -241,7 +241,7 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     tetopt.save_mesh(tmp_path / "many.vtu", loaded.mesh, {"label": labels})
     assert exit_code("convert", tmp_path / "many.vtu", tmp_path / "a.vtu") == 0
     said, kept = capsys.readouterr().err, tetopt.load_mesh(tmp_path / "a.vtu").sets
-    assert "interfaces are not written as sets, which --sets all does" in said
+    assert "interfaces are not written as sets (--sets all writes them)" in said
     assert not [name for name in kept.facets if name.startswith("interface_")]
     assert len(kept.cells) == 60
     assert exit_code("convert", tmp_path / "many.vtu", tmp_path / "all.vtu", "--sets", "all") == 0

@@ -39,7 +39,7 @@ def refused(capsys, *arguments):
 def test_groups_reach_every_file(folder, capsys):
     merge = "white=2,41,16,85; grey=3,42; fluid=24; 7:rest=*"
     assert exit_code(*words(folder, "--merge", merge)) == 0
-    assert "labels merged: 1 into 0, 4 into 1 (white), 2 into 2 (grey), 1 into 3 (fluid), 3 into 7 (rest)" in (
+    assert "merged labels: 1 into 0, 4 into 1 (white), 2 into 2 (grey), 1 into 3 (fluid), 3 into 7 (rest)" in (
         capsys.readouterr().err
     )
     loaded = tetopt.load_mesh(folder / "m.vtu")
@@ -82,7 +82,7 @@ def test_labels_that_share_a_name(folder, capsys):
     (folder / "t.csv").write_text("label,name\n2,white\n41,white\n16,white\n3,grey\n42,grey\n24,csf\n")
     assert exit_code(*words(folder, "--label-names", folder / "t.csv")) == 0
     said = capsys.readouterr().err
-    assert "labels merged, as they share a name: 16 into 2 (white), 41 into 2 (white), 42 into 3 (grey)\n" in said
+    assert "merged labels with the same name: 16 into 2 (white), 41 into 2 (white), 42 into 3 (grey)\n" in said
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert set(loaded.cell_data["label"]) == {0, 2, 3, 24, 85, 502, 515, 516}
     assert loaded.label_table.names == {2: "white", 3: "grey", 24: "csf"}
@@ -100,20 +100,20 @@ def test_groups_may_list_names_of_the_table(folder):
 def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
     assert exit_code(*words(folder, "--merge", "white=2,41; blood=9; rest=*")) == 0
     assert "warning: --merge:" in (said := capsys.readouterr().err)
-    assert "has no label of blood" in said
+    assert "has no label for blood" in said
     labels = tetopt.load_image(folder / "l.nii.gz")
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(np.where(labels.data > 500, 511, labels.data)))
     assert exit_code(*words(folder, "--merge", "synthseg")) == 0
     assert "1 into 5 (soft)" in (said := capsys.readouterr().err)
-    assert "has no label of" not in said
+    assert "has no label for" not in said
 
 
 def test_what_cannot_be_merged(folder, capsys):
-    assert "--merge: there are no --labels" in refused(
+    assert "--merge: needs --labels" in refused(
         capsys, "mesh", folder / "a.nii.gz", "-o", folder / "x.vtu", "--merge", "aseg"
     )
     assert "l.nii.gz: --merge: expected each label" in refused(capsys, *words(folder, "--merge", "white=2,41"))
-    assert "got none for 502, 515, 516" in refused(capsys, *words(folder, "--merge", "a=2,3,16,24,41,42,85"))
+    assert "got no group for 502, 515, 516" in refused(capsys, *words(folder, "--merge", "a=2,3,16,24,41,42,85"))
     assert exit_code(*words(folder, "--merge", "all=0-600")) == 2
     assert "expected two or more labels in the meshed region" in capsys.readouterr().err
     assert 'got "asge"' in refused(capsys, *words(folder, "--merge", "asge"))

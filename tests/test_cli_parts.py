@@ -29,15 +29,15 @@ def inputs(tmp_path_factory):
 
 REFUSED = [
     ("--parts 0", "--parts"),
-    ("--parts 2 --uniform", "--parts: of a graded mesh"),
-    ("--parts 2 --mask ball.nii.gz", "--mask: looks at all cells or voxels at once"),
-    ("--parts 2 --edge-size 9", "--edge-size: looks at all"),
-    ("--parts 2 --order 2", "--order: looks at all"),
+    ("--parts 2 --uniform", "--parts: needs a graded mesh"),
+    ("--parts 2 --mask ball.nii.gz", "--mask: needs all cells or voxels at once"),
+    ("--parts 2 --edge-size 9", "--edge-size: needs all"),
+    ("--parts 2 --order 2", "--order: needs all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
-    ("--parts 4", "--parts: expected up to 3 of 300 nodes, 100 each, got 4; ask for fewer"),
-    ("--parts 4 --predict", "--parts: expected up to 3 of 300 nodes"),
+    ("--parts 4", "--parts: expected at most 3 for 300 nodes (100 each), got 4; use fewer"),
+    ("--parts 4 --predict", "--parts: expected at most 3 for 300 nodes"),
     ("--parts 2 --worker-gb 0", "--worker-gb: expected more than 0"),
-    ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: of workers on this machine"),
+    ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: only for workers on this machine"),
     ("--parts 2 --workers 2 --scheduler tcp://127.0.0.1:9", "--workers: expected none with --scheduler"),
 ]
 
@@ -52,7 +52,7 @@ def test_refused(tmp_path, inputs, monkeypatch, capfd, options, match):
 def test_planes_are_refused(tmp_path, capfd):
     save_image(tmp_path / "plane.nii.gz", tetopt.Image(np.arange(400.0).reshape(20, 20)))
     command = ["mesh", tmp_path / "plane.nii.gz", "--parts", 2, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, "--parts: of a volume, and the image is a plane; leave it out")
+    assert_refused(capfd, command, "--parts: expected a 3-D image, got a 2-D one; omit the option")
 
 
 OF_TWO = ["--nodes", 300, "--parts", 2, "--iterations", 3, "--workers", 1]
@@ -99,7 +99,7 @@ def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypa
     monkeypatch.setattr("tetopt.job.meshing.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         exit_code(*command)
-    assert "in one piece it would take" in capfd.readouterr().err
+    assert "meshing in one piece would take" in capfd.readouterr().err
     assert chosen[0][0].plan.division.n_parts == 1  # as run.json's request has it
     # What parts do not do is tried in one piece, as ever: the bound on its memory is a rough one.
     assert exit_code(*command, "--order", 2, "--iterations", 1) == 0
@@ -120,11 +120,11 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, whole, monkeypatch, capfd):
     changes = [("--k-d", 0.5), ("--nodes", 310), ("--iterations", 9), ("--size-min", 3), ("--crop", "0:22,:,:")]
     for each in [[*command, *change] for change in changes] + [["mesh", other, *command[2:]]]:
         assert exit_code(*each, "-o", tmp_path / "a.vtu") == 2, each
-        assert "a.vtu.work: work directory of another run" in capfd.readouterr().err
+        assert "a.vtu.work: work directory of another, unfinished run" in capfd.readouterr().err
     # A file that comes during the run stays.
     monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
-    assert "a.vtu.work: stays with what is not tetopt's in it: note.txt" in capfd.readouterr().err
+    assert "a.vtu.work was not removed, as it contains foreign files: note.txt" in capfd.readouterr().err
     assert content(folder) == {"note.txt": b"mine"}
     loaded = load_mesh(tmp_path / "a.vtu")
     assert np.array_equal(loaded.mesh.points, whole[0].mesh.points)
@@ -158,7 +158,7 @@ def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, 
         planted(kind, place, elsewhere)
     before = content(tmp_path)
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away, and run this again")
+    assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away and run this again")
     assert content(tmp_path) == before
 
 
@@ -176,7 +176,7 @@ def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inpu
     planted(kind, place / name, elsewhere)
     before = content(tmp_path)
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away, and run this again")
+    assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away and run this again")
     assert content(tmp_path) == before
 
 
@@ -184,19 +184,19 @@ def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):
     command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict"]
     assert exit_code(*command, "--worker-gb", 2) == 0
     captured = capfd.readouterr()
-    assert "--worker-gb: has no say, as the mesh is made in one piece" in captured.err
-    assert "at its peak" in captured.out
+    assert "--worker-gb is ignored: the mesh is built in one piece" in captured.err
+    assert "at peak" in captured.out
 
 
 def test_predicted_parts(tmp_path, inputs, capfd):
     command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict", "--parts", 2]
     assert exit_code(*command, "--worker-gb", 0.1) == 0
     captured = capfd.readouterr()
-    assert captured.out.startswith("about 2 parts in a round, each of up to ")
+    assert captured.out.startswith("about 2 parts per round, each up to ")
     assert "--worker-gb 0.1: less than a worker takes" in captured.err
     assert list(tmp_path.iterdir()) == []
 
 
 def test_places_on_the_network_are_refused(tmp_path, capfd):
     words = ["mesh", "s3://bucket/x.zarr", "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, words, "s3:/bucket/x.zarr: is not on this machine; download it")
+    assert_refused(capfd, words, "s3:/bucket/x.zarr: expected a local file or folder, got a URL; download it")

@@ -81,12 +81,12 @@ def test_refusals_write_nothing(folder, capsys):
         assert words in re.sub(r"\s+", " ", said)
         assert {path.name for path in folder.iterdir()} == before
 
-    refused("--results: expected OUT named .vtu or .vtk", folder / "b.inp", "--results", folder / "a.frd")
+    refused("--results: expected an output file .vtu or .vtk", folder / "b.inp", "--results", folder / "a.frd")
     refused("no such file", folder / "b.vtu", "--results", folder / "c.frd")
     refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
     (folder / "c.vtu").write_bytes((folder / "a.frd").read_bytes())
-    refused("is an input of this command", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
+    refused("is also an input", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
 
 
 def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(folder, order, capsys):
@@ -94,7 +94,7 @@ def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(folder, order, c
     asked = ["--young", "2", "--set", f"tip=point:{corner}:40", "--set", "soft=below:2.5", "--order", str(order)]
     results = ["--results", folder / "a.frd", "--force"]
     assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", *results) == 0
-    assert "a.inp: not the input file of this mesh, or missing" in capsys.readouterr().err
+    assert "a.inp: missing, or not the input file of this mesh" in capsys.readouterr().err
     assert "tip" not in tetopt.load_mesh(folder / "b.vtu").sets.facets
     assert exit_code("convert", folder / "a.vtu", folder / "a.inp", *asked) == 0
     assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", *results) == 0

@@ -94,13 +94,13 @@ def test_bytes_and_other_grids_are_told(folder, capsys):
     tetopt.save_image(folder / "grey.nii.gz", fine)
     assert exit_code(*words(folder, "--tissues", both(folder))) == 0
     said = capsys.readouterr().err
-    assert "grey.nii.gz: taken to the image's voxels, linearly\n" in said
-    assert "white.nii.gz: taken" not in said
+    assert "grey.nii.gz: resampled to the image's grid (linear)\n" in said
+    assert "white.nii.gz: resampled" not in said
 
 
 def test_the_image_may_be_one_of_them(folder, capsys):
     assert exit_code(*words(folder, "--tissues", both(folder), image="white.nii.gz")) == 0
-    assert "the image is one of the tissues: only these count\n" in capsys.readouterr().err
+    assert "the image is one of the tissues: only these are used\n" in capsys.readouterr().err
     assert numbers_in(folder / "m.json")["inputs"]["weights"] == [0.0]
 
 
@@ -108,14 +108,14 @@ def test_what_cannot_be(folder, capfd):
     def refused(match, *more):
         assert_refused(capfd, words(folder, *more), match)
 
-    refused("--labels and --tissues: give one", "--labels", folder / "l.nii.gz", "--tissues", both(folder))
-    refused("--merge: there are no --labels", "--tissues", both(folder), "--merge", "aseg")
-    refused("--label-weight: there are no --labels", "--label-weight", "2")
+    refused("--labels and --tissues: give only one", "--labels", folder / "l.nii.gz", "--tissues", both(folder))
+    refused("--merge: needs --labels", "--tissues", both(folder), "--merge", "aseg")
+    refused("--label-weight: needs --labels", "--label-weight", "2")
     refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},{folder / 'grey.nii.gz'}")
     refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},")
     refused("gone.nii.gz", "--tissues", folder / "gone.nii.gz")
     parts = words(folder, "--tissues", both(folder), "--parts", "2", size=FEW)
-    assert_refused(capfd, parts, "--tissues: looks at all cells or voxels")
+    assert_refused(capfd, parts, "--tissues: needs all cells or voxels")
     for values, match in (
         (100.0 * ROWS[0], "grey.nii.gz: expected probabilities from 0 to 1, got .* to 84"),
         (ROWS[0] - 0.5, "grey.nii.gz: expected probabilities from 0 to 1, got -0.5"),
@@ -155,4 +155,4 @@ def test_a_cohort_finds_those_of_each_subject(folder):
 def test_a_missing_tissue_of_a_cohort_is_named_before_it_runs(folder, capfd):
     (folder / "s.tsv").write_text("subject\timage\ttissues\n1\ta.nii.gz\tgrey.nii.gz,gone.nii.gz\n")
     assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out") == 2
-    assert "gone.nii.gz is not there" in capfd.readouterr().err
+    assert "gone.nii.gz does not exist" in capfd.readouterr().err

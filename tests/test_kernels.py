@@ -246,7 +246,7 @@ def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, tmp_p
         monkeypatch.setattr(cache, "__file__", str(tmp_path / "file" / "system" / "cache.py"))
         monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "file")
     folder, notice = place()
-    assert "compiled anew in each run, half a minute" in notice
+    assert "recompiles the kernels, which takes half a minute" in notice
     assert (chosen if is_chosen else "__pycache__") in notice
     assert "set NUMBA_CACHE_DIR" in notice
     assert "\n" not in notice
@@ -264,7 +264,7 @@ def test_with_nowhere_to_write_nothing_is_kept(place, monkeypatch, tmp_path):
     monkeypatch.setattr(cache.tempfile, "mkdtemp", refuse)
     folder, notice = place()
     assert folder is None
-    assert "compiled anew in each run, a minute" in notice
+    assert "recompiles the kernels, which takes a minute" in notice
     assert kernel_cache.cache_of(row_sum) is None
 
 
@@ -274,7 +274,7 @@ def test_a_folder_that_everybody_may_write_is_no_cache(place, monkeypatch, tmp_p
     tmp_path.chmod(0o777)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder, notice = place()
-    assert f"{tmp_path} can be written by everybody" in notice
+    assert f"{tmp_path} is world-writable" in notice
     assert folder != tmp_path
     os.rmdir(folder)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
@@ -371,7 +371,7 @@ def test_damaged_files_of_the_cache_are_compiled_anew(use):
         said = use()
         assert said[-1] == COMPILED
         assert len(said) == 2
-        assert said[0].startswith("warned: damaged files in the cache of kernels")
+        assert said[0].startswith("warned: recompiling kernels: the cache ")
         assert use() == [LOADED]
 
 
@@ -397,7 +397,7 @@ def test_a_full_disk_or_no_folder_keeps_nothing(use):
     said = use(gone.format(str(use.folder)))
     assert said[-1] == COMPILED
     assert len(said) == 2
-    assert "no longer be written" in said[0] or "cannot be kept" in said[0]
+    assert "no longer writable" in said[0] or "cannot be kept" in said[0]
 
 
 @pytest.mark.deep
@@ -415,7 +415,7 @@ def test_kernels_beside_the_source_are_read_where_others_are_kept(use):
     beside.chmod(0o777)
     said = use()
     assert said[-1] == COMPILED
-    assert f"kernels in {beside} are not loaded" in said[0]
+    assert f"another user could have written those in {beside}" in said[0]
 
 
 def link(path):
@@ -424,7 +424,7 @@ def link(path):
 
 
 UNTRUSTED = {
-    "can be written by others than its owner": lambda path: path.chmod(path.stat().st_mode | 0o020),
+    "is writable by users other than its owner": lambda path: path.chmod(path.stat().st_mode | 0o020),
     "is a link": link,
     "belongs to user 12345": lambda path: os.chown(path, 12345, -1),
 }
@@ -446,7 +446,10 @@ def test_what_others_can_have_written_is_not_loaded(use):
         path.write_bytes(path.read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
         UNTRUSTED[words](path)
     *said, _ = use()
-    assert all(any(words in line and f"kernels in {folder} are not" in line for line in said) for words in kinds)
+    assert all(
+        any(words in line and f"another user could have written those in {folder}" in line for line in said)
+        for words in kinds
+    )
     assert not executed.exists()
     assert use() == [LOADED]
     indices[0].write_bytes(indices[0].read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
@@ -454,7 +457,7 @@ def test_what_others_can_have_written_is_not_loaded(use):
     said = use()
     assert said[-1] == COMPILED
     assert len(said) == 3
-    assert f"{folder.name} can be written by others" in said[0]
+    assert f"{folder.name} is writable by users other than its owner" in said[0]
     assert "cannot be kept" in said[1]
     assert not executed.exists()
 
@@ -588,7 +591,7 @@ def test_a_unit_that_finds_no_memory_says_so(tmp_path, monkeypatch):
     row = Row(np.zeros(4), 1 << 45)  # more than addresses there are
     with pytest.raises(MemoryError):
         over_it(row)
-    with pytest.raises(MemoryError, match="large: 4 of 4 calls found no memory"):
+    with pytest.raises(MemoryError, match="large: 4 of 4 calls could not allocate"):
         run(large, 4, row)
     assert over_it(row._replace(n=4)) == 1.0
 
@@ -635,7 +638,7 @@ def test_kernels_hold_where_numba_has_changed(tmp_path):
     for before, reason in CHANGES:
         said = ran(tmp_path, FENCE.format(before=before), cache=tmp_path, TETOPT_PLAIN_NUMBA="").stdout
         *notices, failure, numbers = said.splitlines()
-        assert failure == "large: 4 of 4 calls found no memory for their arrays"
+        assert failure == "large: 4 of 4 calls could not allocate their arrays"
         assert numbers == f"1.0 [1. 1. 1. 1.] 2.0 {before != ''}"
         for path in tmp_path.glob("*/large_unit*.nb?"):
             path.rename(beside / path.name)

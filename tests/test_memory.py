@@ -92,7 +92,7 @@ def test_a_limit_counts_what_there_is(monkeypatch):
         budget.check_memory(1001, "a", "b")
     budget.check_memory(600, "a", "b", limit=1000)
     with pytest.raises(
-        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in all, 0\.001 MB are allowed; b$"
+        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in total, 0\.001 MB are allowed; b$"
     ):
         budget.check_memory(601, "a", "b", limit=1000)
     assert not budget.MemoryLimit(1000, 600).is_reached()
@@ -140,7 +140,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
     words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force")
     assert exit_code(*words, "--max-gb", "0.001") == 2
-    assert "GB of memory in all, 1 MB are allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
+    assert "GB of memory in total, 1 MB are allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
         "\n", " "
     )
     assert not (tmp_path / "a.vtu").exists()
@@ -160,7 +160,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     exit_code(*words, "--max-gb", "0.001")
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["ended"] == "max_gb"
-    assert "no more memory is allowed: the mesh so far is kept" in capsys.readouterr().err
+    assert "memory limit reached: the mesh so far is kept" in capsys.readouterr().err
     tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
 
 
@@ -176,7 +176,7 @@ def test_a_limit_that_libraries_cannot_live_with_is_said(tmp_path, megabytes):
     words = [sys.executable, "-c", program, "mesh", str(tmp_path / "a.nii.gz"), "-o", str(tmp_path / "a.vtu")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "numba and the other libraries need 1.2 GB; raise it (ulimit -v" in done.stderr
+    assert "numba and other libraries need 1.2 GB; raise the limit (ulimit -v" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     done = subprocess.run([*words[:3], "--version"], capture_output=True, text=True, check=False)
     assert done.returncode == 0
@@ -209,7 +209,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
 
     def make(say):
         say("compiling the kernels, 1 of 57")
-        assert lines == ["compiling the kernels, 1 of 57 (of the first run only), 0 s"]
+        assert lines == ["compiling the kernels, 1 of 57 (first run only), 0 s"]
 
     rows = [IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
 
@@ -243,4 +243,4 @@ def test_warm_up_tells_how_compiling_goes(monkeypatch, capsys):
     monkeypatch.setattr(warm_up, "link", link)
     with pytest.raises(InterruptedError):
         warm_up.warm_up_command()
-    assert "compiling the kernels, 1 of 2 (of the first run only)" in capsys.readouterr().err
+    assert "compiling the kernels, 1 of 2 (first run only)" in capsys.readouterr().err

@@ -44,11 +44,27 @@ def test_each_bound_of_a_package_is_one():
     bounds = {}
     extras = PROJECT["project"]["optional-dependencies"].values()
     for line in itertools.chain(PROJECT["project"]["dependencies"], *extras):
-        name, _, bound = line.partition(">=")
+        name, _, bound = line.partition(";")[0].partition(">=")
         if not name.startswith("tetopt["):
             assert re.fullmatch(r"[0-9.]+", bound), line
             bounds.setdefault(name.lower(), set()).add(bound)
     assert [(name, versions) for name, versions in bounds.items() if len(versions) > 1] == []
+
+
+def test_the_recipe_for_conda_says_what_the_project_says():
+    recipe = yaml.safe_load((ROOT / "docs" / "develop" / "recipe.yaml").read_text(encoding="utf-8"))
+    project = PROJECT["project"]
+    run = recipe["requirements"]["run"]
+    assert run[0] == "python >=${{ python_min }}"
+    assert [each.replace(" ", "").replace("_", "-") for each in run[1:]] == project["dependencies"]
+    assert project["requires-python"] == f">={recipe['context']['python_min']}"
+    assert recipe["context"]["version"] == tetopt.__version__
+    assert recipe["about"]["license"] == project["license"]
+    assert recipe["about"]["summary"] == project["description"]
+    entries = dict(each.split(" = ") for each in recipe["build"]["python"]["entry_points"])
+    assert entries == project["scripts"]
+    built = [each.replace(" ", "") for each in recipe["requirements"]["host"][2:]]
+    assert built == PROJECT["build-system"]["requires"]
 
 
 def test_the_archive_of_sources_has_what_git_has():

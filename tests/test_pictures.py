@@ -56,7 +56,7 @@ def test_a_drawing_is_written_once(tmp_path, capsys):
         assert len(picture.convert("RGB").getcolors(256)) > 10
     before = (tmp_path / "shapes.png").read_bytes()
     assert drawing.main(arguments) == 2
-    assert "exists already; pass `force`" in capsys.readouterr().err
+    assert "already exists; pass `force`" in capsys.readouterr().err
     assert (tmp_path / "shapes.png").read_bytes() == before
     assert drawing.main([*arguments, "--force"]) == 0
     assert (tmp_path / "shapes.png").read_bytes() == before

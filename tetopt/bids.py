@@ -18,10 +18,10 @@ from tetopt.errors import InputError
 LEVELS = ("participant", "group")
 USAGE = "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-label L ...] [options of tetopt cohort]"
 ABOUT = """
-Mesh the images of a BIDS dataset. participant: those of these subjects, or of all; several such runs may go side by
-side into one OUT, of other subjects each. group: the table and the page of all subjects, from what is in OUT.
-All options of `tetopt cohort` follow the level (python -m tetopt cohort --help), those of `tetopt mesh` among them;
-underscores in their names stand for hyphens.
+Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
+subjects, may write to one OUT at the same time. group: write the table and the page of all subjects in OUT.
+All options of `tetopt cohort` follow the level (python -m tetopt cohort --help), including those of `tetopt mesh`;
+their names may contain underscores instead of hyphens.
 """
 
 
@@ -31,7 +31,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the app; the exit code, as of `tetopt cohort`."""
+    """Run the app and return the exit code, that of `tetopt cohort`."""
     open_streams()
     try:
         words = cohort_words(sys.argv[1:] if argv is None else argv)
@@ -42,12 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def cohort_words(arguments: Sequence[str]) -> list[str]:
-    """A BIDS app's arguments as those of the `tetopt` command.
+    """Convert a BIDS app's arguments to those of the `tetopt` command.
 
     Raises
     ------
     InputError
-        Not a folder, a folder and a level, in this order.
+        The arguments do not begin with a folder, a folder and a level.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def cohort_words(arguments: Sequence[str]) -> list[str]:
     known.add_argument("bids_dir")
     known.add_argument("out")
     known.add_argument("level", choices=LEVELS)
-    if not places:  # it may be a request for help, or for the version
+    if not places:  # help or the version may be requested
         known.parse_args(hyphened)
     first = known.parse_args(hyphened[:end])
     last, others = _parser().parse_known_args(hyphened[end:])
@@ -73,7 +73,7 @@ def cohort_words(arguments: Sequence[str]) -> list[str]:
 
 
 def _parser() -> _Parser:
-    """A parser of the options that are not those of `tetopt cohort`, or not in its manner."""
+    """Parser of the options that `tetopt cohort` does not have, or spells differently."""
     parser = _Parser(usage=USAGE, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.allow_abbrev = False
     parser.add_argument(
@@ -81,13 +81,13 @@ def _parser() -> _Parser:
     )
     parser.add_argument("--session-label", nargs="+", default=[], metavar="L", help="with or without ses-")
     for name in ("--skip-bids-validation", "--skip-bids-validator"):
-        parser.add_argument(name, action="store_true", help="taken, as by other apps: datasets are not validated")
+        parser.add_argument(name, action="store_true", help="accepted for compatibility; datasets are never validated")
     parser.add_argument("-v", "--version", action="version", version=f"tetopt {tetopt.__version__}")
     return parser
 
 
 def _with_hyphens(word: str) -> str:
-    """A word of the command line, if it is an option's name, as `tetopt` writes it."""
+    """Replace underscores by hyphens in a word of the command line if it is an option's name."""
     if not word.startswith("--"):
         return word
     name, equals, value = word.partition("=")

@@ -105,7 +105,7 @@ def test_what_a_killed_worker_took_with_it_is_run_again(run, tmp_path):
 
 @pytest.mark.deep
 def test_what_ends_its_worker_three_times_is_said_in_a_line(run, tmp_path):
-    with pytest.raises(InputError, match=r"^b: the worker that ran it ended, 3 times, as systems do") as refusal:
+    with pytest.raises(InputError, match=r"^b: its worker ended, 3 times, as systems do") as refusal:
         run(partial(deadly, tmp_path, 9), list("abc"))
     assert "\n" not in str(refusal.value)
     assert len(list(tmp_path.glob("b.*"))) == 3
@@ -123,7 +123,11 @@ def failing(folder, error, name):
         (KeyError("of a programmer"), KeyError, "of a programmer"),
         (OSError(errno.ENOSPC, "No space left on device", "x\x1b"), InputError, r"^p.1: .*No space left.*free some"),
         (OSError(errno.EACCES, "Permission denied", "x"), PermissionError, "Permission denied"),
-        (MemoryError(), InputError, r"^p.1: takes more memory than a worker may, 0.8 GB with its own \(an alloc"),
+        (
+            MemoryError(),
+            InputError,
+            r"^p.1: needs more memory than a worker may use, 0.8 GB including its own \(an alloc",
+        ),
     ],
 )
 def test_an_error_of_the_function_is_the_clients_at_once(error, kind, words, run, tmp_path):
@@ -143,7 +147,9 @@ def asking(folder, name):
 def test_more_memory_than_a_worker_may_take_is_refused_where_it_is_asked_for(run, crew, tmp_path):
     """In a line that names the limit, and the worker goes on."""
     before = set(crew.client.nthreads())
-    with pytest.raises(InputError, match=r"^p: takes more memory than a worker may, 0.8 GB with its own \(Unable to"):
+    with pytest.raises(
+        InputError, match=r"^p: needs more memory than a worker may use, 0.8 GB including its own \(Unable to"
+    ):
         run(partial(asking, tmp_path), ["p"])
     assert before <= set(crew.client.nthreads())
     assert len(list(tmp_path.iterdir())) == 1
@@ -161,7 +167,9 @@ def filling(folder, name):
 
 @pytest.mark.deep
 def test_a_worker_over_its_limit_is_ended_by_its_nanny_and_the_limit_named(run, tmp_path):
-    with pytest.raises(InputError, match=r"^p: takes more memory than a worker may, 0.8 GB with its own; give"):
+    with pytest.raises(
+        InputError, match=r"^p: needs more memory than a worker may use, 0.8 GB including its own; give"
+    ):
         run(partial(filling, tmp_path), ["p"], attempts=1)
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -197,5 +205,5 @@ def test_a_scheduler_that_is_lost_is_said_so(tmp_path):
         begun_tasks = run_tasks(crew, time.sleep, [0.0, 0.0])
         assert next(begun_tasks).name == 0.0
         crew.client.close()
-        with pytest.raises(SchedulerLost, match="does not answer any more"):
+        with pytest.raises(SchedulerLost, match="no longer answers"):
             next(begun_tasks)

@@ -163,7 +163,7 @@ def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(silent,
         assert exit_code(*command, "-o", tmp_path / "out.vtu", "--nodes", 200, "--scheduler", silent) == 2
         said = capfd.readouterr()
         assert (said.out, said.err.count("\n")) == ("", 1)
-        assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
+        assert f"{silent} does not answer (no reply within 0.3 s)" in said.err
         assert not (tmp_path / "out.vtu").exists()
 
 
@@ -180,7 +180,9 @@ def test_another_service_at_the_address_is_no_scheduler(folders, capfd):
         server.settimeout(10)
         pool.submit(answer)
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(InputError, match=f"^`scheduler`: {address} is not a dask scheduler") as refusal:
+        with pytest.raises(
+            InputError, match=f"^`scheduler`: {address} is another service, not a dask scheduler"
+        ) as refusal:
             running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
     assert "\n" not in str(refusal.value)
     assert capfd.readouterr() == ("", "")
@@ -199,7 +201,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
     assert "expected one of htcondor" in capsys.readouterr().err
     assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--cluster", tmp_path) == 2
-    assert "--scheduler, --cluster: expected one of them" in capsys.readouterr().err
+    assert "--scheduler, --cluster: expected only one of them" in capsys.readouterr().err
     assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
     assert "--workers: expected none with --scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -210,7 +212,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     [
         ({"version": "0.0.1"}, r"expected tetopt .* as here, got 0.0.1"),
         ({"python": "3.9"}, r"expected Python .* as here, got 3.9"),
-        ({"probe": None}, "does not see .*; expected an output folder on a file system that all workers share"),
+        ({"probe": None}, "cannot access .*; expected an output folder on a file system that all workers share"),
         ({"n_threads": 4, "n_bytes": 4 * GB}, r"has 1 GB for each of 4 tasks, .* needs about 3 GB; .*--nthreads 1"),
     ],
 )
@@ -236,7 +238,7 @@ def test_a_worker_that_runs_several_tasks_in_one_process_is_refused(tmp_path):
     answers["tcp://good:1"] = good
     assert newcomers.slots() == 1
     answers["tcp://bad:1"] = good._replace(n_bytes=3.4 * GB)
-    with pytest.raises(InputError, match=r"has 2.83 GB for each of 1 tasks, the largest needs about 3 GB"):
+    with pytest.raises(InputError, match=r"has 2.83 GB for each of 1 tasks, but the largest needs about 3 GB"):
         newcomers.slots()
     answers["tcp://bad:1"] = good._replace(n_threads=4)
     with pytest.raises(InputError, match=r"runs one task at a time, got 4; .* --nthreads 1 --nworkers 4"):
@@ -345,7 +347,7 @@ def test_a_job_whose_workers_run_tasks_themselves_has_their_limits():
         ("lsf", {"mem": 10**9}, Need(1, 4 * GB, None), "mem: expected at least"),
         ("slurm", {"cores": 2}, Need(1, 1.0, 4), "cores: expected at least 4 for 1 tasks of 4 threads, got 2"),
         ("slurm", {"cores": 2, "processes": 3}, Need(1, 1.0, None), "cores: expected at least 3"),
-        ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec, by which a job asks for 5.55 GB here"),
+        ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec to request 5.55 GB per job"),
         ("oar", {}, Need(1, 4 * GB, None), "expected memory-per-core-property-name"),
     ],
 )
@@ -415,7 +417,7 @@ def batch(tmp_path, monkeypatch):
 def test_a_cluster_that_takes_no_job_is_refused(batch, folders, tmp_path, capfd):
     batch("sbatch", "echo no such partition >&2; exit 1")
     path = written(tmp_path, "jobqueue: {slurm: {}}")
-    with pytest.raises(InputError, match=r"the batch system takes no job: no such partition$"):
+    with pytest.raises(InputError, match=r"the batch system refuses jobs: no such partition$"):
         running(Need(9, 1.0, None), folders, count=2, cluster=path).__enter__()
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")
@@ -428,7 +430,7 @@ def test_a_cluster_all_of_whose_jobs_end_as_they_begin_is_given_up(count, batch,
     path = written(tmp_path, "jobqueue: {slurm: {python: /bin/false}}")
     with running(Need(9, 1.0, None), folders, count=count, cluster=path) as crew:
         assert crew.words.startswith(f"up to {count} job")
-        with pytest.raises(InputError, match="jobs ended as they began; their logs in"):
+        with pytest.raises(InputError, match="jobs ended at their start; see their logs in"):
             until(lambda: crew.slots() > 0)
     assert 3 <= len((tmp_path / "submitted").read_text()) < 20
     assert list(folders.work.iterdir()) == []
@@ -489,14 +491,14 @@ def until(condition):
 
 def test_a_cluster_whose_commands_are_not_there_is_refused(folders, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="slurm: sbatch is not there; run this where jobs are submitted"):
+    with pytest.raises(InputError, match="slurm: command sbatch not found; run this where jobs are submitted"):
         running(Need(9, 1.0, None), folders, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
 
 
 def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
     batch("sbatch", "exit 1")
     spaced = Folders(tmp_path / "my work", tmp_path)
-    with pytest.raises(InputError, match="expected an output folder of letters"):
+    with pytest.raises(InputError, match="expected an output folder with only letters"):
         running(Need(9, 1.0, None), spaced, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
 
 

@@ -57,7 +57,7 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
     assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
     assert subjects[2].files == subjects[2].options == {}
     assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
-    with pytest.warns(UserWarning, match=r"left out, without _T1w in ses-b: 1 \(sub-02\)"):
+    with pytest.warns(UserWarning, match=r"left out subjects without _T1w in ses-b: 1 \(sub-02\)"):
         chosen = bids_subjects(folder, sessions=["ses-b"])
     assert rows(chosen, folder) == [("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii")]
 
@@ -76,7 +76,7 @@ def test_entities_choose_among_several(tmp_path):
     assert "run-01_T1w.nii.gz, sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz" in message
     assert "`suffix` acq-mprage_run-01_T1w" in message
     assert "sub-2" not in message  # of two images that without entities is what T1w says
-    with pytest.warns(UserWarning, match=r"left out, without _run-2_T1w: 1 \(sub-2\)"):
+    with pytest.warns(UserWarning, match=r"left out subjects without _run-2_T1w: 1 \(sub-2\)"):
         chosen = bids_subjects(folder, "run-2_T1w")
     assert rows(chosen, folder) == [("1", "", "sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz")]
     assert rows(bids_subjects(folder, "rec-norm_T1w", ["2"]), folder)[0][2] == "sub-2/anat/sub-2_rec-norm_T1w.nii.gz"
@@ -89,7 +89,7 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
     with pytest.raises(Problems) as caught:
         bids_subjects(folder, participants=["1", "2", "8", "9"])
     message = str(caught.value)
-    assert "sub-2/anat/sub-3_T1w.nii.gz: its name is not that of an image in sub-2" in message
+    assert "sub-2/anat/sub-3_T1w.nii.gz: the name does not match its folder sub-2" in message
     assert [line for line in caught.value.lines if "no image" in line] == [
         f"{folder}: sub-{label}: no image _T1w" for label in (2, 8, 9)
     ]
@@ -129,7 +129,7 @@ def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatc
 def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         bids_subjects(tmp_path / "none")
-    with pytest.raises(InputError, match=r"with a dataset_description\.json; or give a table"):
+    with pytest.raises(InputError, match=r"with a dataset_description\.json, or a table"):
         bids_subjects(tmp_path)
     file = tmp_path / "dataset_description.json"
     file.write_text('{"a":')
@@ -139,13 +139,13 @@ def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="a table in JSON, got list"):
         bids_subjects(tmp_path)
     file.write_text("{}")
-    with pytest.raises(InputError, match=r"no image _T1w\.nii\.gz of any subject; `suffix`"):
+    with pytest.raises(InputError, match=r"no subject has an image _T1w\.nii\.gz; use `suffix`"):
         bids_subjects(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", ["", "T1w.nii.gz", "acq-_T1w", "sub-01_T1w", ".*", "T1w\n"])
 def test_suffixes_that_are_none(tmp_path, suffix):
-    with pytest.raises(InputError, match="expected what a BIDS name ends in") as caught:
+    with pytest.raises(InputError, match="expected the end of a BIDS name") as caught:
         bids_subjects(filled(tmp_path / "raw"), suffix)
     assert str(caught.value).isprintable()
 
@@ -157,7 +157,7 @@ def test_names_that_are_no_text_are_no_images(tmp_path):
     assert len(bids_subjects(folder)) == 1
     odd = tmp_path / os.fsdecode(b"\xff")
     shutil.copytree(folder, odd)
-    with pytest.raises(InputError, match="cannot be looked through"):
+    with pytest.raises(InputError, match="cannot be searched"):
         bids_subjects(odd)
 
 

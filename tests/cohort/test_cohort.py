@@ -66,7 +66,7 @@ def test_a_cohort_from_python_is_that_of_the_command(small):
     events = []
     tetopt.run_cohort(small / "t.tsv", str(small / "out"), on=events.append, **one, dry_run=True)
     assert events[-1] == ("note", "1 subject: 1 done; 0 to run", None)
-    with pytest.raises(InputError, match="has no option 'noodes'; is nodes meant"):
+    with pytest.raises(InputError, match="unknown option 'noodes'; did you mean nodes"):
         tetopt.run_cohort(small / "t.tsv", small / "out", noodes=3)
     with pytest.raises(InputError, match=r"^`nodes`: expected a whole number, got 'many'"):
         tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")
@@ -90,7 +90,7 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     assert {name: row["status"] for name, row in rows.items()} == {
         "sub-01": "done", "sub-02": "failed", "sub-03": "failed"
     }  # fmt: skip
-    assert "taken to the image's voxels" in (small / "out" / "logs" / "sub-01.log").read_text()
+    assert "resampled to the image's grid" in (small / "out" / "logs" / "sub-01.log").read_text()
     for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
         reason = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())["reason"]
         assert file in rows[name]["reason"] == reason in (small / "out" / "logs" / f"{name}.log").read_text()
@@ -100,10 +100,10 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     write_rows(small, [*labelled[:3], "80"], ["02", "a.nii.gz", "n/a", "n/a"], far)
     capfd.readouterr()
     assert exit_code(*command, "--dry-run") == 0
-    assert "1 changed: nodes was 60, is 80" in capfd.readouterr().err
+    assert "1 changed: nodes was 60, now 80" in capfd.readouterr().err
     assert exit_code(*command, "--dry-run", "--retry-failed") == 0
     said = capfd.readouterr()
-    assert "1 subjects stay as they are" in said.err
+    assert "1 subjects are out of date" in said.err
     assert "sub-02: " in said.out
     assert "sub-01: " not in said.out
 
@@ -149,7 +149,7 @@ def test_ctrl_c_keeps_what_is_done_and_a_rerun_does_the_rest_though_a_worker_die
     assert run.wait(WAIT_SECONDS) == 130
     words, first = (small / "words.txt").read_text(), meshes(small)
     assert 1 <= len(first) < 5
-    assert "to go on" in words
+    assert "to run only" in words
     assert "Traceback" not in words
     assert {path.name for path in (small / "out" / ".work").iterdir()} == {"lock", "tetopt-manifest"}
     run = begun(small)
@@ -180,14 +180,14 @@ def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
     said = refused(small, capsys)
     places = [int(number) for line in said for number in re.findall(r"^tetopt: \S+t\.tsv, line (\d+): ", line)]
     assert sorted(places) == [2, 3, 4, 5, 6, 7, 8]
-    assert any("nods" in line and "is nodes meant?" in line for line in said)
+    assert any("nods" in line and "did you mean nodes?" in line for line in said)
 
 
 @pytest.mark.parametrize(("options", "words"), [
     (("--threads", "0"), "--threads: expected 1 or more"),
     (("--format", "docx"), "--format: expected one of"),
-    (("--mask", "m-{subject}.nii"), "m-01.nii is not there"), (("--participant-label", "9"), "has no subject 9"),
-    (("--mask", "a.nii.gz", "--background", "3"), "give one of them"),
+    (("--mask", "m-{subject}.nii"), "m-01.nii does not exist"), (("--participant-label", "9"), "has no subject 9"),
+    (("--mask", "a.nii.gz", "--background", "3"), "give only one of them"),
 ])  # fmt: skip
 def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, options, words):
     monkeypatch.chdir(small)
@@ -206,9 +206,9 @@ def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
 def test_threads_are_of_all_subjects_and_a_volume_of_the_first_image_is_an_option(small, capsys):
     """Threads are a part of the machine; those of one subject would be passed over."""
     (small / "t.tsv").write_text("subject\timage\tthreads\n01\ta.nii.gz\t1\n")
-    assert "leave the column out" in refused(small, capsys)[0]
+    assert "remove the column" in refused(small, capsys)[0]
     (small / "t.tsv").write_text("subject\timage\timage_2\n01\ta.nii.gz:0\ta.nii.gz:0\n")
-    assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 is not there"]
+    assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 does not exist"]
 
 
 def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
@@ -223,7 +223,7 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
     (small / "out" / "sub-ab" / "thesis.txt").touch()
     said = refused(small, capsys, "--background", "3")
     assert len(said) == 4
-    for line, words in zip(said, ("line 3: --mask", "datalad get", "is empty", "sub-ab: holds something"), strict=True):
+    for line, words in zip(said, ("line 3: --mask", "datalad get", "is empty", "sub-ab: contains files"), strict=True):
         assert words in line
 
 
@@ -255,10 +255,12 @@ def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
     said = refused(small, capsys, "--k-d", "1.5")
     assert len(said) == 1
     assert "t.tsv, line 2 and 1 more: --k-d: expected 0 <= k_D < 1, got 1.5" in said[0]
-    assert "there is no {sub}; write {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
+    assert (
+        "unknown placeholder {sub}; use {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
+    )
     (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
     (line,) = refused(small, capsys)
-    assert 'nodes: "many" is no value of it; k-d: "0,9" is no value of it; write 0.9' in line
+    assert 'nodes: invalid value "many"; k-d: invalid value "0,9"; write 0.9' in line
 
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
@@ -270,7 +272,7 @@ def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
 
     monkeypatch.setattr(cohort_module, "subjects_of", fail)
     with locked(small / "out"):
-        assert "another run writes there" in refused(small, capsys)[0]
+        assert "another run is writing there" in refused(small, capsys)[0]
 
 
 def test_the_table_of_what_would_be_run(small, capsys):
@@ -287,8 +289,8 @@ def test_the_table_of_what_would_be_run(small, capsys):
 def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--dry-run") == 0
     words = capsys.readouterr().out
-    assert re.search(r"sub-01: \d+ s on a thread, \d+ MB|sub-01: \d+ s on a thread, 0\.\d+ GB", words)
-    assert "in all" in words
+    assert re.search(r"sub-01: \d+ s on one thread, \d+ MB|sub-01: \d+ s on one thread, 0\.\d+ GB", words)
+    assert "in total" in words
     assert not (small / "out").exists()
 
 

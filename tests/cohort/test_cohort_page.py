@@ -56,12 +56,12 @@ def test_what_differs_is_said_with_how_many(tmp_path):
     text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
     hostile = html.escape(plain(plain(HOSTILE)))
     words = f"nodes: 300 (8), 250 (2); k_D: 10 values; gradation: none (9), {hostile} (1)."
-    assert f"Different, with how many subjects have each: {words}" in text
+    assert f"Different, with numbers of subjects: {words}" in text
     assert {"options.nodes", "options.k_D", "request.options.gradation"} <= {
         column["name"] for column in data_of(text)["columns"]
     }
-    assert "Of all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(r"Meshing took [\d.]+ min of computing; start-up and pictures of each come on top[.]", text)
+    assert "Common to all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
+    assert re.search(r"Meshing took [\d.]+ min of computing, without start-up and pictures[.]", text)
 
 
 def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
@@ -112,7 +112,7 @@ def test_many_subjects_have_pictures_of_the_odd_and_of_a_sample(cohort, monkeypa
     assert {place for place, own in enumerate(flags) if own} <= pictured
     assert max(pictured) > 80
     assert "The page has 20 of them" in text
-    assert "Numbers of 1 more labels are in cohort.tsv alone." in text
+    assert "Numbers of 1 more labels are only in cohort.tsv." in text
     assert sum(column["name"].startswith("labels.") for column in data["columns"]) == 2
 
 
@@ -187,7 +187,7 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
     made = document(copied(text, tmp_path / "a.html", FRAMES, BARS))
     lowest, highest, left, right = re.findall(r'<p class="said">([^<]*)</p>', made)
     assert re.fullmatch(r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest)
-    assert re.fullmatch(r"1.\d+ l and more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
+    assert re.fullmatch(r"1.\d+ l or more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
     assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
     assert right == "≥ " + highest[: highest.index(" and")]
 

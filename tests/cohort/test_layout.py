@@ -36,7 +36,7 @@ def test_a_folder_is_new_empty_or_a_cohorts(out, tmp_path):
 )
 def test_a_folder_of_something_else_is_refused(tmp_path, text):
     (tmp_path / "dataset_description.json").write_text(text)
-    with pytest.raises(InputError, match="no cohort's"):
+    with pytest.raises(InputError, match="not a cohort folder"):
         check_out(tmp_path)
 
 
@@ -76,7 +76,7 @@ def locks(out, keys):
     code = "import sys; from pathlib import Path; from tetopt.cohort.layout import locked\n"
     code += "with locked(Path(sys.argv[1]), eval(sys.argv[2])): pass"
     done = subprocess.run([sys.executable, "-c", code, str(out), repr(keys)], capture_output=True, text=True)
-    assert done.returncode == 0 or "another run writes there (process" in done.stderr, done.stderr
+    assert done.returncode == 0 or "another run is writing there (process" in done.stderr, done.stderr
     return done.returncode == 0
 
 

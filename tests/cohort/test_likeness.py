@@ -108,7 +108,7 @@ def test_a_subject_turned_over_is_flagged(tmp_path, turn, words):
         save_run(tmp_path, f"sub-{k}", run_of(rng), body(rng, **(turn if k == 4 else {})))
     flags = flags_of(collect(tmp_path))
     assert [flag.words for flag in flags[4]][:1] == [
-        f"its picture is more like the others' with {words} exchanged; 9 of 10 are less so"
+        f"its picture is more like the others' with {words} exchanged; not so for 9 of 10"
     ]
     assert [k for k, each in enumerate(flags) if each] == [4]
 

@@ -89,7 +89,7 @@ def test_numbers_without_a_mesh_are_a_failure(tmp_path):
     save_run(tmp_path, "sub-1", run_of(RNG), suffix=".inp")
     assert collect(tmp_path)[0].files["mesh"].endswith("_mesh.inp")
     (subject_folder(tmp_path, "sub-1") / mesh_name("sub-1", ".inp")).unlink()
-    assert collect(tmp_path)[0].reason == "there are numbers and no mesh; run it again"
+    assert collect(tmp_path)[0].reason == "its mesh is missing, though there are numbers; run it again"
 
 
 def test_numbers_have_names_with_dots():
@@ -154,7 +154,7 @@ def test_the_table_reads_back(cohort, tmp_path):
     about = json.loads(path.with_suffix(".json").read_text())
     assert list(about) == list(rows[0])
     assert about["labels.17.volume"] == {
-        "Description": "Label 17 (hippocampus): volume of these voxels", "Units": "mm^3"
+        "Description": "Label 17 (hippocampus): volume of its voxels", "Units": "mm^3"
     }  # fmt: skip
 
 

@@ -107,7 +107,7 @@ def test_what_a_worker_takes_with_it_is_run_once_more_and_first(play, tmp_path, 
 
 
 @pytest.mark.parametrize(("end", "words"), [
-    (killed(), "the worker that ran it ended, 2 times"), ("cancelled", "the worker that ran it ended, 2 times"),
+    (killed(), "its worker ended, 2 times"), ("cancelled", "its worker ended, 2 times"),
     (ValueError("first\nlast\x1b[2J"), "ValueError: first last"),
 ])  # fmt: skip
 def test_what_fails_twice_is_a_row(play, tmp_path, end, words):
@@ -129,7 +129,7 @@ def test_a_subject_that_does_not_fit_does_not_begin(play, tmp_path):
     assert {each.key: each.status for each in ended} == {"sub-a": "done", "sub-b": "failed", "sub-c": "done"}
     record = failure(tmp_path, "sub-b")
     assert record["attempts"] == 0
-    assert "is predicted to take 1 GB of memory" in record["reason"]
+    assert "needs 1 GB of memory (predicted)" in record["reason"]
 
 
 def test_where_there_is_no_worker_it_waits_and_where_there_are_more_it_uses_them(play, monkeypatch):
@@ -170,7 +170,7 @@ def test_a_scheduler_that_is_lost_while_it_is_asked_is_said_so(play, tmp_path):
     def no_answer():
         raise ConnectionResetError(104, "in <TCP (closed) ConnectionPool.gather>: Connection reset by peer")
 
-    with pytest.raises(SchedulerLost, match="does not answer any more"):
+    with pytest.raises(SchedulerLost, match="no longer answers"):
         play(FakeClient(), slots=no_answer)
     assert not list((tmp_path / "out" / "logs").iterdir())
 

@@ -35,7 +35,7 @@ def test_each_status_has_its_reason(out):
     saved(out)
     assert status(out) == SubjectState("done", "")
     other = request(options={"nodes": 70, "format": ".vtu"})
-    assert status(out, other) == SubjectState("changed", "nodes was 60, is 70")
+    assert status(out, other) == SubjectState("changed", "nodes was 60, now 70")
     assert state_of(out, KEY, ".vtu", None) == SubjectState("done", "")
     saved(out, violated={"min_dihedral": "too flat", "mask": "too coarse"})
     assert status(out) == SubjectState("violated", "too flat; too coarse")
@@ -65,17 +65,17 @@ def test_what_is_damaged_is_made_again(out, harm):
 
 def test_a_mesh_of_another_format_is_a_change(out):
     saved(out, suffix=".inp", options={"nodes": 60, "format": ".inp"})
-    assert status(out) == SubjectState("changed", "format was .inp, is .vtu")
+    assert status(out) == SubjectState("changed", "format was .inp, now .vtu")
 
 
 def test_differences_are_said_and_the_line_is_short():
     before = request()
     assert differences(before, request(files={"images": [["a.nii", "1"]]})) == "another image"
     assert differences(before, request(files={**before["files"], "mask": [["m", "1"]]})) == "another mask"
-    assert differences(before, request(tetopt="0.2.0")) == "tetopt was 0.1.0, is 0.2.0"
+    assert differences(before, request(tetopt="0.2.0")) == "tetopt was 0.1.0, now 0.2.0"
     many = request(options={"nodes": 60, "format": ".vtu"} | {f"o{k}": k for k in range(6)})
     assert differences(before, many) == (
-        "o0 was none, is 0; o1 was none, is 1; o2 was none, is 2; o3 was none, is 3 and 2 more"
+        "o0 was none, now 0; o1 was none, now 1; o2 was none, now 2; o3 was none, now 3 and 2 more"
     )
 
 
@@ -84,12 +84,12 @@ def test_foreign_files_in_a_subjects_place(out):
     saved(out)
     assert foreign_files(out, KEY) is None
     (out / KEY / "ses-a").mkdir()
-    assert "has sessions, ses-a among them" in foreign_files(out, KEY)
+    assert "has sessions, such as ses-a" in foreign_files(out, KEY)
     (out / "sub-2" / "ses-a").mkdir(parents=True)
     assert "has sessions" in foreign_files(out, "sub-2")
     assert foreign_files(out, "sub-2_ses-b") is None
     (out / "sub-3").mkdir()
     (out / "sub-3" / "thesis.txt").touch()
-    assert "no subject's of this cohort" in foreign_files(out, "sub-3")
+    assert "do not belong to this cohort" in foreign_files(out, "sub-3")
     (out / "sub-4").touch()
-    assert "no subject's of this cohort" in foreign_files(out, "sub-4")
+    assert "do not belong to this cohort" in foreign_files(out, "sub-4")

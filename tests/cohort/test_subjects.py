@@ -56,8 +56,8 @@ def test_tables_as_programs_write_them(tmp_path, suffix, lines):
 
 
 @pytest.mark.parametrize(("lines", "words"), [
-    (["subject,file"], "there is no image"), (["subject,image,image"], "stands there 2 times"),
-    (["subject,image"], "has no subjects"), ([""], "is empty"), (['subject,image', '"a,b'], "mend that line"),
+    (["subject,file"], "missing image"), (["subject,image,image"], "occurs 2 times"),
+    (["subject,image"], "a line for each subject"), ([""], "an empty file"), (['subject,image', '"a,b'], "correct"),
 ])  # fmt: skip
 def test_what_is_no_table_is_refused(tmp_path, lines, words):
     with pytest.raises(InputError, match=words):
@@ -69,7 +69,7 @@ def test_all_lines_that_are_wrong_are_said(tmp_path):
     with pytest.raises(Problems) as raised:
         read_table(path)
     assert [line.removeprefix(f"{path}, ") for line in raised.value.lines] == [
-        "line 2: expected 2 cells, as the first line has, got 1", "line 3: has no subject", "line 4: has no image",
+        "line 2: expected 2 cells as in the first line, got 1", "line 3: missing subject", "line 4: missing image",
     ]  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def test_names_that_come_to_the_same_are_said():
     rows = [subject("a-1"), subject("a1"), subject("--"), subject("b"), subject("b", "x")]
     words = list(doubled(rows))
     assert [line.partition(":")[0] for line in words] == ["row a1", "row --", "row b"]
-    assert "sub-a1 is also that of row a-1" in words[0]
+    assert "sub-a1 is also used by row a-1" in words[0]
     assert "sub-b_ses-x has a session, sub-b (row b) has none" in words[2]
 
 

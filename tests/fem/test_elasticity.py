@@ -564,8 +564,11 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"young": [1.0, 0.0]}, "above 0 kPa, got 1 others, the first 0 in cell 1; give empty space a small modulus"),
-        ({"young": [np.nan, -2.5]}, "got 2 others, the first nan in cell 0, -2.5 in cell 1"),
+        (
+            {"young": [1.0, 0.0]},
+            "above 0 kPa, got 1 invalid values, the first 0 in cell 1; give empty space a small modulus",
+        ),
+        ({"young": [np.nan, -2.5]}, "got 2 invalid values, the first nan in cell 0, -2.5 in cell 1"),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
         ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue use 0.45 to 0.49"),

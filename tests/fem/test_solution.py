@@ -493,7 +493,7 @@ def test_what_cannot_be_solved():
     assert refused(model, 0) == "step: expected 1 to 2, got 0"
     assert refused(model._replace(materials=None)) == "model: the cells have no moduli; give `young`"
     weightless = model._replace(materials=model.materials._replace(density=None))
-    assert refused(weightless) == "gravity: the cells have no density; give `density`, kg/m3, such as 1000"
+    assert refused(weightless) == "gravity: the cells have no density; give `density` in kg/m3, such as 1000"
     other = model._replace(loads=(*model.loads, Load("torque", "superior", np.ones(3))))
     assert refused(other) == 'load: expected displacement, pressure, traction, spring or gravity, got "torque"'
     adrift = model._replace(loads=model.loads[1:])

@@ -32,7 +32,7 @@ RAW_TEXT = re.compile(
     r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|terminate called|libpng|"
     r"TIFF|RuntimeWarning|UserWarning|DeprecationWarning|^WARNING"
 )
-SAID_WRITTEN = re.compile("^written all the same: |is kept", re.MULTILINE)  # outputs before the one that failed
+SAID_WRITTEN = re.compile("^written before the error: |is kept", re.MULTILINE)  # outputs before the one that failed
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 TRACED = re.compile(r'File "[^"]*?(tetopt/[\w/]+\.py)", line (\d+), in (\w+)')
 
@@ -143,7 +143,7 @@ def _of_words(case: Case, ending: Ending) -> tuple[str, str]:
     if len(mistakes) > 1:
         return "refused badly", f"{len(mistakes)} lines: {mistakes[0][:80]} / {mistakes[1][:80]}"
     if (
-        not lines[-1].startswith(("tetopt: ", "written all the same: "))
+        not lines[-1].startswith(("tetopt: ", "written before the error: "))
         or len(mistakes[0]) < SHORTEST_LINE
         or mistakes[0].endswith(": ")
     ):

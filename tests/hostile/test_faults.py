@@ -171,7 +171,7 @@ def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is
         if code == 0:  # what went wrong does not matter
             assert states == ["new"] * len(outputs), watch.reached
         else:
-            line = words.strip().splitlines()[-2 if "written all the same" in words else -1]
+            line = words.strip().splitlines()[-2 if "written before the error" in words else -1]
             assert line.startswith("tetopt: "), words
             assert any(str(out / each) in line for each in outputs), words
         if hidden:  # what cannot be removed
@@ -232,7 +232,7 @@ def _every_allocation(name, inputs, tmp_path, runs, table, stride):
         elif code == 0:  # of the tiny run that prepares kernels, or of the copy that is kept until the file is written
             assert states == ["new"] * len(outputs), allocations.reached
         else:
-            line = words.strip().splitlines()[-2 if "written all the same" in words else -1]
+            line = words.strip().splitlines()[-2 if "written before the error" in words else -1]
             assert (code, line[:8]) == (2, "tetopt: "), (allocations.reached, code, words)
             assert "emory" in line, (allocations.reached, words)
         if name.startswith("mesh") and "is_there" in runs:

@@ -72,7 +72,7 @@ def test_data_that_do_not_fit_are_one_line(convert):
             getattr(mesh, convert)({"a\nb": data})
     with pytest.raises(InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"):
         getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
-    with pytest.raises(InputError, match=r"^cell_data: expected a text as the name of data, got 3"):
+    with pytest.raises(InputError, match=r"^cell_data: expected strings as names, got 3"):
         getattr(mesh, convert)({3: np.zeros(len(mesh.cells))})
     with pytest.raises(InputError, match=r"^point_data: expected a dict of arrays by name, got ndarray"):
         getattr(mesh, convert)(point_data=np.zeros(len(mesh.points)))
@@ -122,7 +122,7 @@ def test_inverted_cells_are_turned_and_others_left_out():
 def test_a_surface_in_the_plane_is_a_mesh():
     sheet = pyvista.Plane(i_resolution=3, j_resolution=2).triangulate()
     assert len(Mesh.from_pyvista(sheet).cells) == 12
-    with pytest.raises(InputError, match="from_pyvista: a mesh of triangles must lie in the plane z = 0"):
+    with pytest.raises(InputError, match="from_pyvista: a triangle mesh must lie in the plane z = 0"):
         Mesh.from_pyvista(pyvista.Sphere())
 
 
@@ -135,26 +135,30 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
     [
         ("pyvista", pyvista.ImageData(dimensions=(2, 2, 2)), "of order 1 or 2, found voxel"),
         ("pyvista", pyvista.PolyData(), "found no cells"),
-        ("pyvista", pyvista.MultiBlock(), "expected one of pyvista's grids of cells, got MultiBlock"),
-        ("pyvista", CORNERS, "expected one of pyvista's grids of cells, got ndarray"),
-        ("pyvista", "a.vtu", "expected one of pyvista's grids of cells, got str"),
-        ("pyvista", None, "expected one of pyvista's grids of cells, got NoneType"),
+        ("pyvista", pyvista.MultiBlock(), "expected a pyvista or VTK grid, got MultiBlock"),
+        ("pyvista", CORNERS, "expected a pyvista or VTK grid, got ndarray"),
+        ("pyvista", "a.vtu", "expected a pyvista or VTK grid, got str"),
+        ("pyvista", None, "expected a pyvista or VTK grid, got NoneType"),
         ("meshio", meshio.Mesh(CORNERS, [TETRA, ("hexahedron", [range(8)])]), "found hexahedron"),
-        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]), "found tetra cells of order 1 and of"),
+        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]), "found tetra cells of both order 1 and"),
         ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
         ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, it holds 0\.\.9"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 whole numbers each, got float64"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 whole numbers each, got .*1, 3"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra10", [range(9)])]), r"tetra10 cells of 10 whole numbers"),
-        ("meshio", meshio.Mesh(np.zeros((10, 4)), [TETRA]), r"two or three real numbers, got float64 of shape \(10, 4"),
-        ("meshio", meshio.Mesh(CORNERS[:, :1], [TETRA]), "two or three real numbers"),
-        ("meshio", meshio.Mesh(CORNERS * 1j, [TETRA]), "real numbers, got complex128"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, it has 0\.\.9"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 integers each, got float64"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 integers each, got .*1, 3"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra10", [range(9)])]), r"tetra10 cells of 10 integers"),
+        (
+            "meshio",
+            meshio.Mesh(np.zeros((10, 4)), [TETRA]),
+            r"two or three real coordinates, got float64 of shape \(10, 4",
+        ),
+        ("meshio", meshio.Mesh(CORNERS[:, :1], [TETRA]), "two or three real coordinates"),
+        ("meshio", meshio.Mesh(CORNERS * 1j, [TETRA]), "real coordinates, got complex128"),
         ("meshio", meshio.Mesh([["a"] * 3] * 4, [TETRA]), "points of real numbers"),
         ("meshio", 3, "expected a meshio.Mesh, got int"),
-        ("skfem", skfem.MeshQuad(), "expected one of scikit-fem's MeshTri or MeshTet, got MeshQuad"),
+        ("skfem", skfem.MeshQuad(), "expected a scikit-fem MeshTri or MeshTet, got MeshQuad"),
         ("skfem", skfem.MeshLine(), "got MeshLine"),
-        ("skfem", skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)), r"4 whole numbers each.*\(0, 4\)"),
+        ("skfem", skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)), r"4 integers each.*\(0, 4\)"),
         ("skfem", sample_model(3).mesh, "got Mesh"),
     ],
 )

@@ -177,7 +177,7 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
         with pytest.raises(tetopt.InputError, match=line):
             mesh.plot(values, off_screen=True)
     for path in (tmp_path / "no folder" / "a.png", tmp_path / "a.xyz"):
-        with pytest.raises(tetopt.InputError, match=r"^plot: .*: the picture cannot be written \(.*\)$"):
+        with pytest.raises(tetopt.InputError, match=r"^plot: .*: cannot write the picture \(.*\)$"):
             mesh.plot(screenshot=path)
 
 

@@ -87,7 +87,7 @@ def test_they_come_back_and_go_on(suffix, n, tmp_path):
     save_model(tmp_path / f"a{suffix}", model)
     back = load_mesh(tmp_path / f"a{suffix}")
     np.testing.assert_allclose(back.mesh.midpoints, model.mesh.midpoints, rtol=1e-14, atol=1e-13)
-    assert any("edges are curved, by up to" in note for note in back.notes)
+    assert any("edges are curved by up to" in note for note in back.notes)
     assert tetopt.build_model(back).order == 2
     tetopt.save_mesh(tmp_path / "b.vtu", back.mesh, order=2)
     np.testing.assert_array_equal(load_mesh(tmp_path / "b.vtu").mesh.midpoints, back.mesh.midpoints)

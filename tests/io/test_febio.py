@@ -237,9 +237,9 @@ def test_awkward_names():
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (sample_model(2), "tetrahedra, got triangles"),
+        (sample_model(2), "tetrahedral mesh, got triangles"),
         (sample_model()._replace(materials=None, loads=()), "needs a material"),
-        (sample_model()._replace(cell_data={"v": np.zeros(3)}), 'is called "v"'),
+        (sample_model()._replace(cell_data={"v": np.zeros(3)}), 'needs the name "v"'),
     ],
 )
 def test_what_it_cannot_carry(model, message):
@@ -295,7 +295,7 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
 
 
 def test_several_steps_are_several_files():
-    with pytest.raises(InputError, match="febio: a file is one step, got 2"):
+    with pytest.raises(InputError, match="febio: expected one step, got 2"):
         febio(loaded_model(["1/hold:left", "2/hold:left"]))
 
 

@@ -101,7 +101,7 @@ def assert_whole(path, model):
 
 def saved(path, model):
     """Written, with warnings on names as those of the tests, and as bytes."""
-    with pytest.warns(UserWarning, match="names that it cannot hold"):
+    with pytest.warns(UserWarning, match="names the format does not support"):
         save_model(path, model)
     return path.read_bytes()
 
@@ -172,7 +172,7 @@ def test_two_names_never_become_one():
     data |= {"pair": np.column_stack([values, values]), "pair_1": values + 4}
     long = {300 * "é" + str(k): values + k for k in range(3)}
     model = sample_model()._replace(cell_data=data | long, loads=())
-    with pytest.warns(UserWarning, match=r"called a\\n_2"):
+    with pytest.warns(UserWarning, match=r"support: a\\n_2"):
         columns = set(re.findall(r'<ElementData name="([^"]*)"', file_bytes(Path("a.feb"), model).decode()))
     assert len(columns) == 10
 
@@ -194,7 +194,7 @@ def test_names_of_any_length(suffix, tmp_path):
 def test_sets_that_some_format_cannot_name_are_refused(name, suffix, tmp_path):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets | {name: model.sets.facets["boundary"]}, model.sets.cells)
-    with pytest.raises(InputError, match=r"the name of a set is a letter, then up to 71 letters") as error:
+    with pytest.raises(InputError, match=r"expected set names of a letter and up to 71 letters") as error:
         save_model(tmp_path / f"a{suffix}", model._replace(sets=sets))
     assert plain(str(error.value)) == str(error.value)
     assert list(tmp_path.iterdir()) == []
@@ -203,7 +203,7 @@ def test_sets_that_some_format_cannot_name_are_refused(name, suffix, tmp_path):
 def test_sets_that_differ_by_case_alone_are_refused(tmp_path):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets, model.sets.cells | {"BOUNDARY": np.array([0])})
-    with pytest.raises(InputError, match="two sets are called BOUNDARY"):
+    with pytest.raises(InputError, match="two sets have the name BOUNDARY"):
         save_model(tmp_path / "a.vtu", model._replace(sets=sets))
 
 
@@ -227,17 +227,17 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
 
 @pytest.mark.parametrize("name", ["a", "a.vtu.gz"])
 def test_a_suffix_of_no_format_is_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"unknown suffix; known are \.vtu .*, \.inp"):
+    with pytest.raises(InputError, match=r"unknown suffix; known suffixes are \.vtu .*, \.inp"):
         save_mesh(tmp_path / name, sample_model().mesh)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(tmp_path):
-    with pytest.raises(InputError, match=r"a\.pvtu: \.pvtu is not written; use \.vtkhdf"):
+    with pytest.raises(InputError, match=r"a\.pvtu: cannot write \.pvtu; use \.vtkhdf"):
         save_mesh(tmp_path / "a.pvtu", sample_model().mesh)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.PVTU").write_text("<VTKFile/>")
-    with pytest.raises(InputError, match=r"a\.PVTU: \.pvtu is not read; save the mesh as \.vtkhdf"):
+    with pytest.raises(InputError, match=r"a\.PVTU: cannot read \.pvtu; save the mesh as \.vtkhdf"):
         tetopt.load_mesh(tmp_path / "a.PVTU")
 
 
@@ -295,7 +295,7 @@ def test_a_registered_format_is_written_alike_by_all(registered, tmp_path, capsy
 
 
 def test_what_a_registered_format_does_not_hold_is_refused(registered, tmp_path):
-    with pytest.raises(InputError, match=r"a\.pts: only \.vtu, .* take quadratic cells"):
+    with pytest.raises(InputError, match=r"a\.pts: only \.vtu, .* support quadratic cells"):
         save_model(tmp_path / "a.pts", quadratic_model())
     assert list(tmp_path.iterdir()) == []
 
@@ -314,7 +314,7 @@ def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".INP", "pts", "", ".a/b", ".p\n"])
 def test_suffixes_that_no_format_can_have(suffix):
-    with pytest.raises(InputError, match=r"^suffix: (tetopt writes \.\w+ itself|expected a dot)") as caught:
+    with pytest.raises(InputError, match=r"^suffix: (\.\w+ is a built-in format|expected a dot)") as caught:
         tetopt.register_format(suffix, str)
     assert "\n" not in str(caught.value)
     assert suffix not in FORMATS.keys() - formats.BUILT_IN
@@ -349,6 +349,6 @@ def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
     path.write_bytes(b"old")
     write = Path.write_bytes
     monkeypatch.setattr(Path, "write_bytes", lambda self, whole: write(self, whole[:-1] + bytes([whole[-1] ^ 1])))
-    with pytest.raises(OSError, match="what was written reads back otherwise"):
+    with pytest.raises(OSError, match="the file reads back differently"):
         save_model(path, model)
     assert path.read_bytes() == b"old"

@@ -87,7 +87,7 @@ def test_of_increments_the_last_is_taken(tmp_path):
     text = path_of(1).read_text().replace("           1           2 ", "           2           1 ")
     (tmp_path / "a.frd").write_text(text)
     results = read_frd(tmp_path / "a.frd", solved_model(1).mesh)
-    assert results.notes == ("step 1: increment 2, the last that is in the file",)
+    assert results.notes == ("step 1: increment 2, the last in the file",)
     assert_printed(results.point_data["displacement"], our_displacement(1, 2))
     assert "displacement_step2" not in results.point_data
 
@@ -96,7 +96,7 @@ def test_what_the_head_does_not_say_is_assumed(tmp_path):
     """Stresses in kPa; the axes are those that fit."""
     (tmp_path / "a.frd").write_text(re.sub("1Utetopt; [^\n]*", "1Utest", path_of(2).read_text()))
     results, known = (read_frd(path, solved_model(2).mesh) for path in (tmp_path / "a.frd", path_of(2)))
-    assert results.notes == ("a.frd does not say its units: stresses are taken for kPa",)
+    assert results.notes == ("a.frd does not state its units: assuming kPa for stresses",)
     np.testing.assert_array_equal(results.point_data["displacement"], known.point_data["displacement"])
     np.testing.assert_allclose(1e3 * results.point_data["stress_nodes"], known.point_data["stress_nodes"], rtol=1e-12)
 
@@ -113,28 +113,28 @@ def refused(tmp_path, words, text=None, mesh=None):
 def test_results_of_another_mesh_are_refused(tmp_path):
     mesh = solved_model(1).mesh
     other = Mesh(mesh.points * [1.0, 1.0, 1.001], mesh.cells)
-    refused(tmp_path, "is of another mesh: 14 of 14 nodes are elsewhere, by up to 0.121 mm", mesh=other)
+    refused(tmp_path, "belongs to another mesh: 14 of 14 nodes are displaced by up to 0.121 mm", mesh=other)
     refused(
-        tmp_path, "expected 5 cells and 8 nodes, or 26 of quadratic cells; it has 24 and 14", mesh=solved_model(2).mesh
+        tmp_path, "expected 5 cells and 8 nodes .order 2: 26., got 24 cells and 14 nodes", mesh=solved_model(2).mesh
     )
     refused(tmp_path, "expected 23 cells and 14 nodes", mesh=Mesh(mesh.points, mesh.cells[:-1]))
-    refused(tmp_path, "its nodes are connected otherwise", mesh=Mesh(mesh.points, mesh.cells[::-1]))
+    refused(tmp_path, "its nodes are connected differently", mesh=Mesh(mesh.points, mesh.cells[::-1]))
     numbers = path_of(1).read_text().replace(" -1        14", " -1        99")
     refused(tmp_path, "its nodes are not numbered from 1 to 14", re.sub(r"(?<=\s)14\b", "99", numbers))
     plane = Mesh([[0.0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    refused(tmp_path, "expected a mesh of tetrahedra beside CalculiX's results, got one of triangles", mesh=plane)
+    refused(tmp_path, "expected a tetrahedral mesh for CalculiX's results, got triangles", mesh=plane)
 
 
 def test_files_without_whole_results_are_refused(tmp_path):
     text = path_of(1).read_text()
     refused(tmp_path, "expected CalculiX's results", "")
     refused(tmp_path, "expected CalculiX's results", "*NODE\n")
-    refused(tmp_path, "is cut off; is CalculiX still running", text[: len(text) // 2])
-    refused(tmp_path, "is cut off", text.replace(" 9999", ""))
+    refused(tmp_path, "the file is truncated; is CalculiX still running", text[: len(text) // 2])
+    refused(tmp_path, "the file is truncated", text.replace(" 9999", ""))
     refused(tmp_path, "has no results", text[: text.index("    1PSTEP")] + " 9999\n")
-    refused(tmp_path, "has no displacements in step 1; ask for U", text.replace("DISP  ", "DISPR "))
+    refused(tmp_path, "has no displacements in step 1; request U", text.replace("DISP  ", "DISPR "))
     refused(tmp_path, "has results at 13 of 14 nodes in step 1", text.replace("          14    ", "          13    "))
-    refused(tmp_path, "DISP of step 1 is not a number at some nodes", _nan(text))
+    refused(tmp_path, "DISP of step 1 is not finite at some nodes", _nan(text))
     with pytest.raises(InputError, match="no such file"):
         read_frd(tmp_path / "b.frd", solved_model(1).mesh)
 

@@ -289,7 +289,7 @@ def test_comments_tell_image_units_constants_and_loads(version):
     for k, (young, nu) in enumerate(zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True), 1):
         assert f"material_{k}: young {young!r} MPa, nu {nu!r}" in comments
     for load in model.loads:
-        assert f"load, which this format has no place for: {load_words(load)}" in "\n".join(comments)
+        assert f"load (not supported by this format): {load_words(load)}" in "\n".join(comments)
     left_out = [line for line in comments if "cell data" in line]
     others = ", ".join(name for name in model.cell_data if name != "label")  # which the groups are
     assert [line.endswith(others) for line in left_out] == ([True] if version == "2.2" else [])
@@ -338,7 +338,9 @@ def test_names_that_are_taken(version, kind):
     model = unlabelled(sample_model())
     members = next(iter(getattr(model.sets, kind).values()))
     model = model._replace(sets=model.sets._replace(**{kind: {"Material_2": members}}))
-    with pytest.raises(InputError, match=r'^set Material_2: the file calls something else "Material_2"; call the set'):
+    with pytest.raises(
+        InputError, match=r'^set Material_2: the file uses the name "Material_2" for something else; rename the set'
+    ):
         WRITERS[version](model)
 
 

@@ -100,13 +100,13 @@ def test_a_background_without_a_colour_has_none(tmp_path):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "found none"),
-        ("# only a comment\n\n", "found none"),
-        ("spleen\n", r'line 1: expected a table of labels .* got "spleen"'),
-        ("1,spleen\n", r'line 1: expected a table .* a row of names with "label"'),
-        ("label,colour\n1,#ffffff\n", "a row of names"),
+        ("", "found no lines"),
+        ("# only a comment\n\n", "found no lines"),
+        ("spleen\n", r'line 1: expected a label table .* got "spleen"'),
+        ("1,spleen\n", r'line 1: expected a label table .* a row of column names with "label"'),
+        ("label,colour\n1,#ffffff\n", "a row of column names"),
         ("label,name\n1,spleen\n\n2\n", 'line 4: expected 2 columns, as in the first row, got "2"'),
-        ("label,name\nx,spleen\n", 'line 2: expected a label, a whole number from 0, got "x" under label'),
+        ("label,name\nx,spleen\n", 'line 2: expected a whole number from 0 in column label, got "x"'),
         ("label,name\n-1,spleen\n", 'got "-1"'),
         ("label,name\n1.5,spleen\n", 'got "1.5"'),
         ("index\tname\tcolor\n1\tspleen\tred\n", 'line 2: expected a colour as #rrggbb, got "red"'),
@@ -115,10 +115,10 @@ def test_a_background_without_a_colour_has_none(tmp_path):
         ("label,name,r,g,b\n1,spleen,0.1,0.2,2\n", "from 0 to 1, got 0.1, 0.2, 2"),
         ("0 a 0 0 0 0\n1 spleen 256 0 0 0\n", "line 2: expected red, green and blue from 0 to 255"),
         ("0 a 0 0 0 0\n1 spleen\n", 'line 2: expected label, name, red, .* got "1 spleen"'),
-        ('0 0 0 0 0 0 0 "a"\n1 spleen 1 2 3 0\n', "line 2: expected label, red, .* as ITK-SNAP has it"),
+        ('0 0 0 0 0 0 0 "a"\n1 spleen 1 2 3 0\n', "line 2: expected label, red, .* as in ITK-SNAP"),
         (
             "label,name\n1,spleen\n2,liver\n1,stomach\n",
-            'line 4: label 1 is "stomach", but on line 2 it is "spleen"; give each label once',
+            'line 4: label 1 is "stomach", but "spleen" on line 2; list each label only once',
         ),
         ("1 (none) 1 2 3 0\n", "expected names of labels, found none"),
         ("label,name\n1," + 200_000 * "x" + "\n", "line 2: "),
@@ -134,10 +134,10 @@ def test_what_is_refused(tmp_path, text, match):
 def test_other_files(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_label_table(tmp_path / "none.txt")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="got a folder"):
         load_label_table(tmp_path)
     for encoding in ("latin-1", "utf-16"):
-        with pytest.raises(InputError, match="expected text in UTF-8"):
+        with pytest.raises(InputError, match="expected UTF-8 text"):
             table_of(tmp_path, SNAP, encoding=encoding)
 
 
@@ -206,11 +206,11 @@ def test_a_name_means_its_labels(text, labels):
 
 
 def test_names_that_no_label_has():
-    with pytest.raises(InputError, match='label "livre": no label is called so; did you mean liver'):
+    with pytest.raises(InputError, match='label "livre": no label has this name; did you mean liver'):
         labels_named("livre", NAMES)
-    with pytest.raises(InputError, match="there are Spleen, liver, left lung"):
+    with pytest.raises(InputError, match="known names are Spleen, liver, left lung"):
         labels_named("xyzzy", NAMES)
-    with pytest.raises(InputError, match="no label has a name; give a table of them"):
+    with pytest.raises(InputError, match="labels have no names; give a table of names"):
         labels_named("liver", {})
     assert label_words(5, NAMES) == "5 (liver)"
     assert label_words(55, NAMES) == "55"

@@ -118,14 +118,16 @@ def test_order_2(n):
         assert np.array_equal(read.refs[f"{KEYWORD[dim]}P2"], linear.refs[KEYWORD[dim]])
         for at, edge in enumerate([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)][: dim * (dim + 1) // 2], dim + 1):
             assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
-    assert "point data, which this format has no place for: displacement, warmth" in read.comments
+    assert "point data (not supported by this format): displacement, warmth" in read.comments
     named = [line.replace("P2 ref", " ref") for line in read.comments if " ref " in line]
     assert named == [line for line in linear.comments if " ref " in line]
 
 
 def test_refused():
     model = sample_model()
-    with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
+    with pytest.raises(
+        InputError, match=r'^set material_1: the file uses the name "material_1" for something else; rename the set'
+    ):
         medit(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
 

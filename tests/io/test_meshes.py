@@ -176,7 +176,7 @@ def test_quadratic_cells_become_their_corners(tmp_path, n):
     grid.save(tmp_path / "a.vtu")
     back = load_mesh(tmp_path / "a.vtu")
     assert (back.order, back.n_left, back.n_turned) == (2, 0, len(range(0, grid.n_cells, 3)))
-    assert back.notes == ("point data left out, as they are no numbers: name",)
+    assert back.notes == ("dropped point data that are not numbers: name",)
     assert back.cell_data["k"].tolist() == list(range(grid.n_cells))
     nodes = np.argsort(place[: len(mesh.points)])  # the corners in the order of the file, as ours are read
     np.testing.assert_array_equal(back.mesh.points, mesh.points[nodes])
@@ -257,7 +257,7 @@ def test_curved_edges_are_kept_and_told(tmp_path, n):
     back = load_mesh(tmp_path / "a.vtu")
     (note,) = back.notes
     off = f"{0.25 * length[7]:.2g}"
-    assert note == f"2 of {len(edges)} edges are curved, by up to {off} mm"
+    assert note == f"2 of {len(edges)} edges are curved by up to {off} mm"
     in_file = np.asarray(grid.points)[place[first:], :n]
     assert sorted(back.mesh.midpoints.tolist()) == sorted(in_file.tolist())
     np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells).sum(), volumes(mesh.points, mesh.cells).sum())
@@ -276,7 +276,7 @@ def test_two_middle_nodes_of_one_edge_are_told(tmp_path):
     grid = pyvista.UnstructuredGrid({QUADRATIC: cells}, np.vstack([points, [0.5, 0.5, 0.0]]))
     grid.save(tmp_path / "a.vtu")
     assert load_mesh(tmp_path / "a.vtu").notes == (
-        "1 edges have a middle node in each of their cells: one of them is taken",
+        "1 edges have different mid-edge nodes in their cells: using one of them",
     )
 
 
@@ -352,13 +352,13 @@ def test_every_physical_group_becomes_a_set_of_a_valid_name(tmp_path, is_binary)
         "skin_2": [0], "Skin_3": [0], "ok-1": [0], "volume_7": [1], "H_hle": [1]
     }  # fmt: skip
     assert set(back.notes) == {
-        '"my left" is the set my_left_2 here',
-        f'"{LONG}a" is the set {LONG[:MOST_LETTERS]} here',
-        f'"{LONG}b" is the set {LONG[: MOST_LETTERS - 2]}_2 here',
-        '"1st" is the set set_1st here',
-        '"skin" is the set skin_2 here',
-        '"Skin" is the set Skin_3 here',
-        '"Höhle" is the set H_hle here',
+        'renamed group "my left" to set my_left_2',
+        f'renamed group "{LONG}a" to set {LONG[:MOST_LETTERS]}',
+        f'renamed group "{LONG}b" to set {LONG[: MOST_LETTERS - 2]}_2',
+        'renamed group "1st" to set set_1st',
+        'renamed group "skin" to set skin_2',
+        'renamed group "Skin" to set Skin_3',
+        'renamed group "Höhle" to set H_hle',
     }
 
 
@@ -390,7 +390,7 @@ def test_groups_without_a_name_in_2d(tmp_path):
     back = load_mesh(tmp_path / "a.msh2")
     assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {"edge_3": [[0, 2], [1, 2]]}
     assert {name: members.tolist() for name, members in back.sets.cells.items()} == {"surface_4": [1]}
-    assert back.notes == ('"edge_6" is left out: none of it is a facet of a cell',)
+    assert back.notes == ('dropped group "edge_6": it contains no facets of cells',)
 
 
 def test_groups_of_materials_give_way_to_moduli(tmp_path):
@@ -432,13 +432,13 @@ def assert_refused(capfd, caplog):
 
 def test_a_missing_file(tmp_path, assert_refused):
     assert_refused(tmp_path / "no.vtu", "no such file")
-    assert_refused(tmp_path, "no such file")
+    assert_refused(tmp_path, "got a folder")
 
 
 @pytest.mark.parametrize("name", ["a.stl", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"named \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2$")
+    assert_refused(tmp_path / name, r"expected a \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2 mesh$")
 
 
 @pytest.mark.deep
@@ -485,7 +485,7 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
         ({TETRA: [[0, 1, 2, 3]], QUAD: [[0, 1, 4, 2]]}, "found quad"),
         (
             {TETRA: [[0, 1, 2, 3]], QUADRATIC: [[0, 1, 2, 4, 4, 5, 0, 1, 2, 3]]},
-            "expected cells of one order, found tetra cells of order 1 and of order 2",
+            "expected cells of one order, found tetra cells of both order 1 and order 2",
         ),
         ({QUADRATIC - 2: [[0, 1, 2, 3, 4, 5]]}, "plane z = 0"),
         ({QUADRATIC: [[0, 1, 2, 2, 4, 5, 4, 5, 4, 5]]}, "1 of 1 are flat"),
@@ -519,8 +519,8 @@ def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
         ("0 1 2 2", "1", "1 of 1 are flat"),
         ("0 1 2 3", "nan", "expected finite coordinates, but node 3"),
         ("0 1 2 3", "inf", "expected finite coordinates, but node 3"),
-        ("0 1 2 7", "1", "nodes 0..7, it holds 0..4"),
-        ("0 1 2 -1", "1", "nodes -1..2, it holds 0..4"),
+        ("0 1 2 7", "1", "nodes 0..7, it has 0..4"),
+        ("0 1 2 -1", "1", "nodes -1..2, it has 0..4"),
         ("0 1 2", "1", "damaged"),
     ],
 )
@@ -533,4 +533,4 @@ def test_a_middle_node_that_there_is_not(tmp_path, assert_refused):
     text = VTU.format(nodes="0 1 2 3 4 4 4 4 4 9", z="1")
     text = text.replace('"ascii">10<', '"ascii">24<').replace('"ascii">4<', '"ascii">10<')
     (tmp_path / "a.vtu").write_text(text)
-    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it holds 0..4; damaged")
+    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it has 0..4; damaged")

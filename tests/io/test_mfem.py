@@ -140,7 +140,7 @@ def test_order_2_adds_the_middle_of_each_edge_once(n):
     assert (read.cell_sets, read.facet_sets) == (linear.cell_sets, linear.facet_sets)
     expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
     assert sorted(read.middles.tolist()) == sorted(expected.tolist())
-    assert "point data, which this format has no place for: displacement, warmth" in read.comments
+    assert "point data (not supported by this format): displacement, warmth" in read.comments
 
 
 @pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])

@@ -137,13 +137,13 @@ def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
 
 
 def test_stl_has_no_room_for_labels(tmp_path):
-    with pytest.raises(InputError, match=r"STL holds no labels of triangles; take \.ply or \.vtp or \.vtk"):
+    with pytest.raises(InputError, match=r"STL cannot store labels of triangles; use \.ply or \.vtp or \.vtk"):
         save_surface(tmp_path / "a.stl", extract_surface(*CUBE_CORNER, [0]), labels={"label": np.zeros(4, dtype=int)})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_one_line_for_every_bad_file(tmp_path):
-    with pytest.raises(InputError, match=r"a\.obj: expected a surface named \.stl or \.ply or \.vtp or \.vtk"):
+    with pytest.raises(InputError, match=r"a\.obj: expected a name ending in \.stl or \.ply or \.vtp or \.vtk"):
         save_surface(tmp_path / "a.obj", extract_surface(*CUBE_CORNER, [0]))
     with pytest.raises(InputError, match="no such surface file"):
         checked_surface(tmp_path / "none.stl")

@@ -111,10 +111,10 @@ def test_a_child_has_limits(some_file):
 @pytest.mark.parametrize(
     ("read", "words"),
     [
-        (crash, r"a test crashed at this file \(SIGABRT; .* copy or export it again"),
+        (crash, r"a test crashed on this file \(SIGABRT; .* copy or export it again"),
         (greedy, r"needs more than 2\.1 GB of memory"),
         (stumbling, r"truncated or damaged; copy it again \(KeyError: 'what\\nis this'\)"),
-        (endless, "was not read within 1 s by a test"),
+        (endless, "a test did not read it within 1 s"),
     ],
 )
 def test_a_child_that_fails_is_one_line(some_file, monkeypatch, read, words):
@@ -173,15 +173,15 @@ VTK_BOMBS = {
     "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "NumberOfPoints is -4"),
     "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
     "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "NumberOfTuples is"),
-    "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed at"),
-    "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed at"),
+    "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed on"),
+    "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed on"),
     "entity.vtu": (b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VTKFile/>', "document type or entities"),
-    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, its 146 bytes can hold 146 at most"),
+    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, its 146 bytes can hold at most 146"),
     "cells.vtk": (legacy(cells=2**60), "CELLS is"),
     "minus.vtk": (legacy(points=-1), "POINTS is -1"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),
     "field.vtk": (legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"), "is 2147483647"),
-    "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed at this file .SIG"),
+    "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed on this file .SIG"),
 }
 
 
@@ -200,7 +200,7 @@ def test_the_bombs_are_else_good(tmp_path, name, raw):
 
 def test_cells_of_another_number_of_nodes(tmp_path):
     (tmp_path / "a.vtk").write_bytes(legacy(numbers=4).replace(b"4 0 1 2 3", b"3 0 1 2"))
-    refused(load_mesh, tmp_path / "a.vtk", r"damaged: cells of 4 nodes \(tetra\) have another number")
+    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, some have another number")
     (tmp_path / "a.vtk").write_bytes(legacy().replace(b"\n10\n", b"\n99\n"))
     refused(load_mesh, tmp_path / "a.vtk", "no cells of type 99|damaged")
 
@@ -259,15 +259,15 @@ ITK_BOMBS = {
     "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
     "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
     "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
-    "huge.mha": (mha(sizes="32767 32767 32767"), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
-    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "tells of 32767 x"),
-    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "tells of 3 x 4 x 5 voxels, 6e.10 bytes"),
+    "huge.mha": (mha(sizes="32767 32767 32767"), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
+    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "announces 32767 x"),
+    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "announces 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "voxels of type MET_OTHER"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
     "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
-    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "tells of 99999999999 x 9 x 9 voxels"),
-    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "tells of 32767 x"),
+    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "announces 99999999999 x 9 x 9 voxels"),
+    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "announces 32767 x"),
     "long.nrrd": (nrrd(sizes="9" * 5000), "expected 3 sizes"),
 }
 
@@ -306,7 +306,7 @@ def test_voxels_lie_beside_their_header(tmp_path, name):
     }
     for header, raw in headers.items():
         (inner / header).write_bytes(raw)
-        refused(load_image, inner / header, "only a file beside the header, by its bare name, is read|damaged")
+        refused(load_image, inner / header, "given by its bare name|damaged")
 
 
 @pytest.mark.parametrize(
@@ -323,14 +323,14 @@ def test_no_header_hides_where_its_voxels_are(tmp_path, header):
     if header.startswith("#"):
         header = header * 11_000 + "data file: ../a.raw\n"
     (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
-    refused(load_image, tmp_path / "inner" / "a.nhdr", "by its bare name, is read|a header of more than 1048576 bytes")
+    refused(load_image, tmp_path / "inner" / "a.nhdr", "given by its bare name|a header of more than 1048576 bytes")
 
 
 def test_no_list_of_files_goes_on_unread(tmp_path):
     pytest.importorskip("SimpleITK")
     (tmp_path / "one.raw").write_bytes(bytes(60))
     (tmp_path / "a.mhd").write_bytes(mha(file="LIST\n" + "one.raw\n" * 140_000 + "/etc/passwd", data=b""))
-    refused(load_image, tmp_path / "a.mhd", "a header of more than 1048576 bytes, its voxels elsewhere")
+    refused(load_image, tmp_path / "a.mhd", "a header of more than 1048576 bytes with separate data files")
 
 
 @pytest.mark.parametrize("n_slices", [1, 4])
@@ -372,10 +372,10 @@ def nifti(path, shape=(3, 4, 5), offset=352.0, extension=b"\0\0\0\0", data=bytes
 @pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
 def test_nifti_bombs(tmp_path, name):
     assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
-    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13")
+    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13")
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
-    refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels are to begin at byte 1e.30")
-    refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels are to begin at byte nan")
+    refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels would begin at byte 1e.30")
+    refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels would begin at byte nan")
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nrrd"])
@@ -386,14 +386,14 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
     monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
     refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* are free; crop or resample it first")
     if name == "a.nrrd":
-        refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, of which parts are read$")
+        refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$")
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nii"])
 def test_a_file_that_goes_on(tmp_path, name):
     """Only as much is unpacked, or read for the checksum, as the header tells of, and what may lie behind that."""
     path = nifti(tmp_path / name, data=bytes(2**25))
-    refused(load_image, path, "it goes on far behind the last voxel")
+    refused(load_image, path, "it continues far after the last voxel")
 
 
 SKIPPED = {"a.mha": "", "a.mhd": f"HeaderSize = {2**25}\n", "a.nrrd": f"byte skip: {2**25}\n"}
@@ -415,13 +415,13 @@ def test_voxels_after_a_header_that_go_on(tmp_path, name):
         if more:
             assert checked_header(path)[1] == 60
         else:
-            refused(load_image, path, "it goes on far behind the last voxel")
+            refused(load_image, path, "it continues far after the last voxel")
 
 
 def test_postscript_in_a_picture(tmp_path):
     """Pillow goes by what a file holds, and gives PostScript to Ghostscript."""
     (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
-    refused(load_image, tmp_path / "a.png", "Pillow knows no such picture")
+    refused(load_image, tmp_path / "a.png", "unknown to Pillow")
 
 
 def test_a_picture_of_too_many_pixels(tmp_path):
@@ -430,7 +430,7 @@ def test_a_picture_of_too_many_pixels(tmp_path):
     data = zlib.compress(b"")
     body += struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-    refused(load_image, tmp_path / "a.png", "its 1048576 x 1048576 pixels are more than")
+    refused(load_image, tmp_path / "a.png", "expected at most 1073741824 pixels, got 1048576 x 1048576")
 
 
 # --------------------------------------------------------------------------------------------------

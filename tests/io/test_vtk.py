@@ -100,7 +100,7 @@ def test_point_data_of_another_length_is_refused():
     model = quadratic_model(3)
     for values in (np.ones(5), np.ones(len(model.point_data["displacement"]) + 1)):
         with pytest.raises(
-            InputError, match=r"^point data: expected a row for each of \d+ corner nodes or of \d+ in all"
+            InputError, match=r"^point data: expected one row per corner node \(\d+\) or per node \(\d+\)"
         ):
             vtu(model._replace(point_data={"odd": values}))
 
@@ -135,7 +135,7 @@ def test_stresses_of_an_unknown_unit_are_left_out(tmp_path):
     back = load_mesh(tmp_path / "a.vtu")
     assert list(back.point_data) == ["kept"]
     assert not {"young", "nu", "material"} & set(back.cell_data)
-    assert back.notes == ('moduli and stresses left out, as their unit is neither kPa nor MPa: "psi"',)
+    assert back.notes == ('dropped moduli and stresses, as their unit is neither kPa nor MPa: "psi"',)
 
 
 def test_the_head_of_a_legacy_file_is_what_3d_slicer_looks_for(tmp_path):
@@ -204,7 +204,7 @@ def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(tmp_p
     back = load_mesh(tmp_path / f"b.{suffix}")
     assert back.sets == ({}, {})
     (note,) = back.notes
-    assert note.startswith("sets left out, as the file does not tell that its cells are still those that they were wr")
+    assert note.startswith("dropped sets, as the cells may have changed")
     assert set(note.split(": ")[1].split(", ")) == {*sample_model(3).sets.facets, *sample_model(3).sets.cells}
 
 

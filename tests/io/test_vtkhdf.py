@@ -148,7 +148,7 @@ def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
     beyond = cells.copy()
     beyond[0, 0] = len(points)
     write_pieces(tmp_path / "a.vtkhdf", [pieces[0], (points, beyond, *data), pieces[2]])
-    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: cells use nodes that their piece does not hold"):
+    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: cells use nodes that their piece does not have"):
         load_mesh(tmp_path / "a.vtkhdf")
     write_pieces(tmp_path / "a.vtkhdf", pieces)
     with h5py.File(tmp_path / "a.vtkhdf", "r+") as file:
@@ -212,24 +212,24 @@ def empty_bomb(root):
 
 
 BAD = {
-    "soft": (linked(h5py.SoftLink("/VTKHDF/CellData/volume")), '"mean" is a link to elsewhere'),
-    "external": (linked(h5py.ExternalLink("/etc/passwd", "/")), '"mean" is a link to elsewhere'),
-    "whole group": (linked(h5py.ExternalLink("b.h5", "/"), "PointData"), '"PointData" is a link to elsewhere'),
-    "virtual": (virtual, '"mean" lies in another file'),
-    "outside": (outside, '"mean" lies in another file'),
-    "bomb": (empty_bomb, 'damaged: "mean" is of 8796093022208 bytes, the file has 0 for it'),
-    "lzf": (changed("CellData/mean", np.zeros(192), compression="lzf"), '"mean" is packed in a way that is not read'),
-    "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" holds neither numbers nor texts'),
+    "soft": (linked(h5py.SoftLink("/VTKHDF/CellData/volume")), 'expected data for "mean", got a link'),
+    "external": (linked(h5py.ExternalLink("/etc/passwd", "/")), 'expected data for "mean", got a link'),
+    "whole group": (linked(h5py.ExternalLink("b.h5", "/"), "PointData"), 'expected data for "PointData", got a link'),
+    "virtual": (virtual, '"mean" is stored in another file'),
+    "outside": (outside, '"mean" is stored in another file'),
+    "bomb": (empty_bomb, 'damaged: "mean" should have 8796093022208 bytes, the file stores 0'),
+    "lzf": (changed("CellData/mean", np.zeros(192), compression="lzf"), '"mean" has an unsupported compression'),
+    "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" has neither numbers nor texts'),
     "short": (changed("CellData/mean", np.zeros(191)), 'damaged: "mean" has 191 rows, its pieces 192'),
-    "three axes": (changed("CellData/mean", np.zeros((192, 2, 2))), "no array of one or two axes"),
+    "three axes": (changed("CellData/mean", np.zeros((192, 2, 2))), "not an array with one or two axes"),
     "counts": (changed("NumberOfCells", [192, 0]), "damaged"),
     "overflow": (changed("NumberOfCells", [2**62, 2**62, 2**63 - 1]), "damaged"),
     "minus": (changed("NumberOfCells", [-1, 97, 96]), "damaged: NumberOfCells is not"),
-    "planar": (changed("Points", np.zeros((4, 2))), "not three coordinates"),
-    "floats": (changed("Types", np.zeros(192)), "no lists of whole numbers"),
-    "group": (linked(np.zeros(3), "PointData"), '"PointData" is no group'),
-    "no cells": (lambda root: root.pop("Connectivity"), '"Connectivity" is no array'),
-    "steps": (steps, "found steps of time"),
+    "planar": (changed("Points", np.zeros((4, 2))), "do not have three coordinates"),
+    "floats": (changed("Types", np.zeros(192)), "not lists of integers"),
+    "group": (linked(np.zeros(3), "PointData"), '"PointData" is not a group'),
+    "no cells": (lambda root: root.pop("Connectivity"), '"Connectivity" is not an array'),
+    "steps": (steps, "found time steps"),
     "image": (attribute("Type", np.bytes_("ImageData")), "expected an unstructured grid, found ImageData"),
     "version": (attribute("Version", [3, 0]), "version 1 or 2"),
 }
@@ -266,7 +266,5 @@ def test_a_file_cut_off_and_cells_beyond_their_points(file_path):
 def test_without_h5py_a_line_says_what_to_install(file_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     for call in (lambda: load_mesh(file_path), lambda: vtkhdf(sample_model())):
-        with pytest.raises(
-            InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or take \.vtu'
-        ):
+        with pytest.raises(InputError, match=r'\.vtkhdf files need h5py: pip install "h5py(>=[0-9.]+)?", or use \.vtu'):
             call()

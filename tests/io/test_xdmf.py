@@ -238,11 +238,9 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
 def test_values_that_vtk_cannot_read_are_refused(value):
     model = sample_model()
     data = {"mean": model.cell_data["mean"], "odd": np.array([value] + [1.0] * (len(model.mesh.cells) - 1))}
-    with pytest.raises(
-        InputError, match=r'^xdmf: expected finite cell data, got 1 values of "odd" that are not; take .vtu$'
-    ):
+    with pytest.raises(InputError, match=r'^xdmf: expected finite cell data, got 1 invalid values of "odd"; use .vtu$'):
         xdmf(model._replace(cell_data=data))
-    with pytest.raises(InputError, match=r'^xdmf: expected finite point data, got 1 values of "odd" that are not'):
+    with pytest.raises(InputError, match=r'^xdmf: expected finite point data, got 1 invalid values of "odd"'):
         xdmf(model._replace(point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}))
 
 

@@ -34,7 +34,7 @@ def said():
     ("change", "words"),
     [
         ({}, ""),
-        ({"distance_p95": 8.0, "distance_mean": 2.0}, "8.0 voxels apart at the 95th percentile, 2.0 in the mean"),
+        ({"distance_p95": 8.0, "distance_mean": 2.0}, "8.0 voxels apart at the 95th percentile, 2.0 on average"),
         ({"reverse_p95": 8.0}, "8.0 voxels apart"),
         ({"distance_p95": np.nan, "reverse_p95": np.nan}, ""),
         ({"mesh_euler": -47}, "Euler number of the mask's surface is 2, that of the mesh's boundary -47"),
@@ -82,11 +82,11 @@ def ended(E=0.5, E_D=0.5):
     ("result", "mode", "nodes", "measured", "words"),
     [
         (ended(), "graded", 100, {}, ""),
-        (ended(), "graded", 120, {}, "100 nodes instead of 120: more iterations"),
-        (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes take about 107; ask for as many"),
-        (ended(E_D=1.2), "start", None, {}, "E_D ended at 1.200 times what it was"),
+        (ended(), "graded", 120, {}, "100 nodes instead of 120: use more iterations"),
+        (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes take about 107; set `nodes` to that"),
+        (ended(E_D=1.2), "start", None, {}, "E_D ended at 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),
-        (ended(), "graded", None, {"cells_without_voxel": 1}, "1 of 1 cells hold no voxel centre"),
+        (ended(), "graded", None, {"cells_without_voxel": 1}, "1 of 1 cells contain no voxel centre"),
         (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),
     ],
 )
@@ -98,11 +98,11 @@ def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
 
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
-    for slices, words in ((1.5, "fewer nodes"), (5.5, "slices are 5.5 mm apart")):
+    for slices, words in ((1.5, "reduce `nodes`"), (5.5, "slices are 5.5 mm apart")):
         warn_of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices]))
         text = said()
         assert words in text
-        assert ("fewer nodes" in text) == (slices < 2.0)
+        assert ("reduce `nodes`" in text) == (slices < 2.0)
 
 
 def test_limits_and_targets_that_edges_miss(said):
@@ -114,7 +114,7 @@ def test_limits_and_targets_that_edges_miss(said):
     warn_of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None)
     assert "the shortest edge is 1.5 mm, 25% under `size_min` 2" in said()
     warn_of_sizes(Sizes(edge_size=5.0), 1.5, 28.8, edges._replace(above=0.4))
-    assert "40% of the edges are over 1.41 times their target size" in said()
+    assert "40% of the edges are longer than 1.41 times their target size" in said()
 
 
 def test_nodes_between_many_labels():
@@ -133,6 +133,6 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     numbers = numbers_in(tmp_path / "a.json")
     n_empty = int((tetopt.load_mesh(tmp_path / "a.vtu").cell_data["n_voxels"] == 0).sum())
     assert numbers["cells_without_voxel"] == n_empty > 0
-    row = next(line for line in out.splitlines() if line.startswith("cells that hold no voxel centre"))
+    row = next(line for line in out.splitlines() if line.startswith("cells without a voxel centre"))
     assert row.split()[-1] == str(n_empty)
     assert numbers["violated"] == {}

@@ -54,13 +54,13 @@ def test_python_has_the_numbers_of_the_commands(place, capfd):
 
 def test_refusals_name_arguments(place):
     mesh = place / "a.vtu"
-    with pytest.raises(InputError, match=r"^`mask` and `labels`: give the `image`"):
+    with pytest.raises(InputError, match=r"^`mask` and `labels`: need an `image`"):
         judge(mesh, labels=place / "image.nii.gz")
-    with pytest.raises(InputError, match=r"moduli: give `young`"):
+    with pytest.raises(InputError, match=r"moduli: pass `young`"):
         solve_file(mesh, model=ModelOptions(), part=LabelledPart())
-    with pytest.raises(InputError, match=r"^`mask`: there is no `image`"):
+    with pytest.raises(InputError, match=r"^`mask`: needs `image`"):
         convert_file(mesh, place / "b.inp", solver=SolverOptions(), part=LabelledPart(), mask=mesh)
-    with pytest.raises(InputError, match=r"give one of `below`, `label`, `cell_set`"):
+    with pytest.raises(InputError, match=r"give exactly one of `below`, `label`, `cell_set`"):
         write_surface(mesh, place / "b.stl", SurfacePart())
 
 

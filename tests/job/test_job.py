@@ -33,14 +33,14 @@ def test_values_are_brought_to_the_kinds_of_their_options():
     ({"nodes": 3}, "`nodes`: expected a whole number, 5 or more, got 3"),
     ({"k_D": 2}, "`k_D`: expected 0 <= k_D < 1, got 2.0"),
     ({"iterations": -1}, "`iterations`: expected 0 or more, got -1"),
-    ({"images": []}, r"`images`: expected a path or a list of such, got \[\]"),
+    ({"images": []}, r"`images`: expected a path or a list of them, got \[\]"),
     ({"mask": ""}, "`mask`: expected a path, got ''"),
     ({"mask": "a\0b"}, "`mask`: expected a path, got"),
     ({"lattice": "x"}, "`lattice`: expected bcc or five-tet or criss-cross or octree, got 'x'"),
     ({"force": "yes"}, "`force`: expected True or False, got 'yes'"),
     ({"units": None}, "`units`: expected a text, got None"),
-    ({"nodes": 30, "spacing": 2.0}, "`nodes` and `spacing`: give one of them"),
-    ({"mask": "m.nii", "background": 3}, "`mask` and `background`: give one of them"),
+    ({"nodes": 30, "spacing": 2.0}, "`nodes` and `spacing`: give only one of them"),
+    ({"mask": "m.nii", "background": 3}, "`mask` and `background`: give only one of them"),
     ({"output": "a.docx"}, "a.docx: unknown suffix"),
     ({"young": "x" * 5000}, "`young`: formula: expected numbers"),
 ])  # fmt: skip
@@ -70,7 +70,7 @@ def test_json_gives_the_job_back():
 
 @pytest.mark.parametrize(("text", "words"), [
     ("3", "expected an object of options, got int"), ("{", "expected JSON"), ("[" * 100_000, "nested too deeply"),
-    ('{"images": ["a"]}', "needs output"), ('{"images": ["a"], "output": "b.vtu", "nods": 3}', "is nodes meant"),
+    ('{"images": ["a"]}', "missing output"), ('{"images": ["a"], "output": "b.vtu", "nods": 3}', "did you mean nodes"),
     ('{"images": ["a"], "output": "b.vtu", "nodes": "3"}', "`nodes`: expected a whole number, got '3'"),
 ])  # fmt: skip
 def test_json_that_is_no_job(text, words):
@@ -85,6 +85,5 @@ def test_every_option_has_its_kind_and_its_help():
     shared = {field.name for field in fields(RunOptions)}
     assert shared < {field.name for field in fields(JobOptions)} == set(inspect.signature(Job).parameters)
     assert given_options(Job(**FILES)) == {"images": [Path("a.nii")], "output": Path("a.vtu")}
-    assert f"    nodes : int, optional\n        {option_of(kinds_of(Job)['nodes']).text[:40]}" in inspect.getdoc(
-        tetopt.Job
-    ).replace("\n", "\n    ")
+    words = option_of(kinds_of(Job)["nodes"]).text[:40]
+    assert f"\nnodes : int, optional\n    {words}" in inspect.getdoc(tetopt.Job)

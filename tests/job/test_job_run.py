@@ -151,7 +151,7 @@ def test_an_input_is_no_output_and_a_refused_run_leaves_no_folder(inputs, tmp_pa
     job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "x.vtu", nodes=60, iterations=0)
     tetopt.run(job)
     before = (tmp_path / "x.vtu").read_bytes()
-    with pytest.raises(tetopt.InputError, match="is an input of this command too"):
+    with pytest.raises(tetopt.InputError, match="is also an input"):
         tetopt.run(
             tetopt.Job(images=inputs / "a.nii.gz", start=tmp_path / "x.vtu", output=tmp_path / "x.vtu", force=True)
         )

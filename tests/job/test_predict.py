@@ -45,14 +45,14 @@ def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
     assert exit_code(*words) == 0
     lines = capsys.readouterr().out.replace("\n", " ")
     assert "s on 1 thread, in nine of ten cases" in lines
-    assert "MB of memory at its peak" in lines or "GB of memory at its peak" in lines
+    assert "MB of memory at peak" in lines or "GB of memory at peak" in lines
     assert sorted(tmp_path.rglob("*")) == before
     monkeypatch.setattr(cli_predict, "calibrated_speed", lambda: 1e-3)
     monkeypatch.setattr(cli_predict, "available_bytes", lambda: 1000)
     assert exit_code(*words[:2], "-o", tmp_path / "a.vtu", "--target-error", "0.5", "--predict") == 0
     said = capsys.readouterr()
-    assert "of 4 runs with 5000 nodes" in said.out
-    assert "0.001 MB of memory are free, less than this run takes" in said.err.replace("\n", " ")
+    assert "assuming 4 runs with 5000 nodes" in said.out
+    assert "only 0.001 MB of memory is free, less than this run takes" in said.err.replace("\n", " ")
 
 
 def test_what_a_run_refuses_its_prediction_does(image_path, tmp_path, capsys):

@@ -108,9 +108,9 @@ def test_sizes_of_labels_in_a_file(tmp_path):
         assert sizes == {3: LabelSize(1.5), 4: LabelSize(0.6, True, 1.0, 10.0), "*": LabelSize(6.0)}
     for text, match in (
         ("fluid,thin", 'sizes.csv: label_size: expected mm, .* got "thin"'),
-        ("fluid,1.5\nbrain,2", 'sizes.csv: label_size: no label is called "brain"; fluid, bone'),
+        ("fluid,1.5\nbrain,2", 'sizes.csv: label_size: no label has the name "brain"; fluid, bone'),
         ("fluid,1.5\n3,2", "sizes.csv: label_size: label 3 has two sizes"),
-        ("fluid", 'sizes.csv: expected rows of a name and what it has, got "fluid"'),
+        ("fluid", 'sizes.csv: expected rows of a name and values, got "fluid"'),
         ("", "sizes.csv: label_size: expected"),
     ):
         file.write_text(text)
@@ -154,10 +154,10 @@ def test_options_of_a_row_replace_those_of_all():
 
 
 @pytest.mark.parametrize(("texts", "words"), [
-    ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "nodes: .1e3. is no value of it"),
-    ({"nonlinear": "maybe"}, "expected true or false"), ({"iterations": "-1"}, "iterations: .-1. is no value of it"),
-    ({"method": "Fast"}, "method: .Fast. is no"), ({"nodes": "9" * 20, "k-d": "x"}, "no value of it; k-d: .x. is no"),
-    ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
+    ({"nods": "1"}, "did you mean nodes"), ({"nodes": "1e3"}, "nodes: invalid value .1e3."),
+    ({"nonlinear": "maybe"}, "expected true or false"), ({"iterations": "-1"}, "iterations: invalid value .-1."),
+    ({"method": "Fast"}, "method: invalid value .Fast."), ({"nodes": "9" * 20, "k-d": "x"}, "; k-d: invalid value .x."),
+    ({"json": "a.json"}, "not an option"), ({"help": "1"}, "not an option"),
 ])  # fmt: skip
 def test_options_of_a_row_that_cannot_be(texts, words):
     with pytest.raises(InputError, match=words):

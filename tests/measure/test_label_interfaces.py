@@ -263,5 +263,5 @@ def test_differences_in_words():
         "label 5 (liver [left]): 1 component of voxels, 3 of cells; 1 hole more",
         "label 6: 2 components of voxels, 1 of cells; 2 cavities more",
         "label 7: 2 holes fewer",
-        "label 9: 62% of its size lost",
+        "label 9: 62% smaller",
     ]

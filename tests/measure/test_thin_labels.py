@@ -180,5 +180,6 @@ def test_tables_have_the_worst_five_alone():
     assert contact_table(contacts[-1:], {}, 3) is None
     words = contacts_in_words(contact_totals(contacts[-2:]), 2)
     assert words == (
-        "contact over 1.2 times the voxels': 119.0 mm, of which 90.0 mm between labels that do not touch in the voxels"
+        "contact beyond 1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels that do not touch in "
+        "the voxels"
     )

@@ -67,7 +67,7 @@ def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
 def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
     loaded = saved(tmp_path, named(sample_model(3)))
     facets = {name: rows for name, rows in loaded.sets.facets.items() if name != "inferior"}
-    with pytest.warns(UserWarning, match="loads are left out: it no longer has the sets inferior"):
+    with pytest.warns(UserWarning, match="dropped the file's loads: it no longer has the sets inferior"):
         assert tetopt.build_model(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads == ()
 
 

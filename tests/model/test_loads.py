@@ -109,9 +109,9 @@ def test_components_and_steps_keep_displacements_apart():
         (["squeeze:5%"], "expected compress:5%, hold:SET"),
         (["compress:5"], "expected compress:P%"),
         (["compress:51%"], "expected compress:P%"),
-        (["hold:nowhere"], 'no set of facets "nowhere"; there are boundary, left'),
+        (["hold:nowhere"], 'no set of facets "nowhere"; known sets are boundary, left'),
         (["hold:Left"], "did you mean left"),
-        (["hold:dark"], '"dark" is a set of cells; give one of facets, such as boundary'),
+        (["hold:dark"], '"dark" is a set of cells; give a set of facets, such as boundary'),
         (["hold:left", "move:right:1,2"], "3 finite numbers in mm or free"),
         (["hold:left", "move:right:1,2,inf"], "3 finite numbers"),
         (["move:right:free,free,free"], "3 finite numbers"),
@@ -124,11 +124,11 @@ def test_components_and_steps_keep_displacements_apart():
         (["0/hold:left"], "a step of 1 or more"),
         (["first/hold:left"], "a step of 1 or more"),
         (["9" * 5000 + "/hold:left"], "a step of 1 or more"),
-        (["1/hold:left", "9999/hold:left"], "a step 9999, but no load is of step 2 alone"),
-        (["hold:left", "3/pressure:right:1"], "a step 3, but no load is of step 2 alone"),
-        (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "cannot go both ways"),
-        (["move:left:free,0,free", "move:posterior:1,2,free"], "cannot go both ways"),
-        (["compress:5%", "hold:superior"], "cannot go both ways"),
+        (["1/hold:left", "9999/hold:left"], "a step 9999, but none has step 2"),
+        (["hold:left", "3/pressure:right:1"], "a step 3, but none has step 2"),
+        (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "already have a prescribed displacement"),
+        (["move:left:free,0,free", "move:posterior:1,2,free"], "already have a prescribed displacement"),
+        (["compress:5%", "hold:superior"], "already have a prescribed displacement"),
     ],
 )
 def test_loads_that_are_none(texts, match):
@@ -154,7 +154,7 @@ def test_an_organ_is_pressed_along_the_world_axis(n):
 def test_no_side_to_press():
     """A tetrahedron has a tip and no top; the sets that it has are named."""
     mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-    with pytest.raises(InputError, match=r"no facet of the mesh is superior; .* boundary, left, posterior, inferior"):
+    with pytest.raises(InputError, match=r"the mesh has no facets superior; .* boundary, left, posterior, inferior"):
         parse_loads(["compress:5%"], mesh, standard_sets(mesh))
 
 

@@ -65,20 +65,20 @@ def test_a_function_equal_to_a_table_gives_the_same():
         ([(1, 2, 3)], "mapping: expected pairs (intensity, kPa), got an array of shape (1, 3)"),
         ("soft", "mapping: expected pairs (intensity, kPa), got 'soft'"),
         ([(0, 1), (1,)], "mapping: expected pairs (intensity, kPa), got [(0, 1), (1,)]"),
-        ([(0, 1), (5, np.nan)], "mapping: every intensity and modulus must be finite, got [[0.0, 1.0], [5.0, nan]]"),
+        ([(0, 1), (5, np.nan)], "mapping: expected finite intensities and moduli, got [[0.0, 1.0], [5.0, nan]]"),
         (
             [(0, -1), (10, 9)],
-            "modulus: expected 0 kPa or more, got 1 others, such as -1 at intensity 0; "
+            "modulus: expected 0 kPa or more, got 1 invalid values, such as -1 at intensity 0; "
             "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
             lambda h: 4.0 - h,
-            "modulus: expected 0 kPa or more, got 2 others, such as -1 at intensity 5, -6 at intensity 10; "
+            "modulus: expected 0 kPa or more, got 2 invalid values, such as -1 at intensity 5, -6 at intensity 10; "
             "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
             lambda h: np.where(h > 5, np.inf, 1.0),
-            "modulus: expected 0 kPa or more, got 1 others, such as inf at intensity 10; "
+            "modulus: expected 0 kPa or more, got 1 invalid values, such as inf at intensity 10; "
             "give a modulus mapping (`young`) that is positive over the image's range",
         ),
         (
@@ -103,7 +103,7 @@ def test_labels_that_are_none(text):
 
 
 def test_a_mapping_of_the_intensity_alone():
-    with pytest.raises(InputError, match="expected one of the intensity"):
+    with pytest.raises(InputError, match="expected a mapping of the intensity"):
         parse_mapping("1=2")
 
 
@@ -154,7 +154,7 @@ def test_labels_from_a_file(tmp_path):
         ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
         ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
         ("a.csv", "intensity;young\n1;2,1\n", "write 2.1 for 2,1"),
-        ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
+        ("a.csv", "intensity,young\n1,nan\n", "expected finite"),
         ("a.csv", "label,young\n1,2\n1,3\n", "label 1 has two values"),
         ("a.csv", "label,young\n1.5,2\n", "columns of numbers"),
         ("a.csv", "label,young,young\n1,2,3\n", "each column once"),
@@ -180,7 +180,7 @@ def test_separators_of_csv(tmp_path, separator):
 
 def test_csv_of_another_encoding(tmp_path):
     (tmp_path / "a.csv").write_bytes("name,young\nMäuse,2\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r'expected text in UTF-8, .* in Excel as "CSV UTF-8"'):
+    with pytest.raises(InputError, match=r'expected UTF-8 text, .* in Excel as "CSV UTF-8"'):
         load_mapping(tmp_path / "a.csv")
 
 

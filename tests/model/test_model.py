@@ -29,7 +29,7 @@ def test_lps_turns_points_and_loads_about_z():
     assert turned.space == "lps"
     assert in_space(model, "ras") is model
     np.testing.assert_array_equal(in_space(turned, "ras").mesh.points, model.mesh.points)
-    for wrong, match in (("las", "expected ras or lps"), ("lps", "leave out `space`")):
+    for wrong, match in (("las", "expected ras or lps"), ("lps", "omit `space`")):
         with pytest.raises(InputError, match=match):
             in_space(sample_model(2), wrong)
 
@@ -53,8 +53,8 @@ def test_the_head_is_of_single_lines():
         "coordinates: RAS+, mm",
         "units: mm, kPa, mN, uJ, kg, s",
         "image: a b.nii, sha256 00",
-        f"materials: bins, modulus off by {model.materials.binning.mean:.3%} in the mean by volume, "
-        f"{model.materials.binning.largest:.3%} at most",
+        f"materials: bins, error of the modulus {model.materials.binning.mean:.3%} (mean by volume), "
+        f"{model.materials.binning.largest:.3%} (largest)",
     ]
     assert "of the slice's plane" in described(sample_model(2))[1]
 

@@ -217,14 +217,14 @@ def test_near_a_point_and_a_plane():
         ("dark", "expected NAME=below:T"),
         ("dark=below:x", "expected 1 number"),
         ("dark=below:-5", "no cell has a mean below -5"),
-        ("1a=below:12", "a name is a letter"),
-        ("LEFT=point:0,0,0:1", r'there is a set "left" already|no facet'),
-        ("Boundary=below:12", 'there is a set "boundary" already'),
+        ("1a=below:12", "expected a name of a letter"),
+        ("LEFT=point:0,0,0:1", r'a set "left" exists already|no boundary facet'),
+        ("Boundary=below:12", 'a set "boundary" exists already'),
         ("p=point:0,0:1", "expected 3 numbers"),
         ("p=point:0,0,0", "expected point:X,Y,Z:D"),
         ("p=plane:0,0,0:1", "expected plane:X,Y,Z:NX,NY,NZ:D"),
-        ("p=plane:0,0,0:0,0,0:1", "normal must not be 0"),
-        ("p=point:0,0,0:0.1", "the nearest does within"),
+        ("p=plane:0,0,0:0,0,0:1", "expected a normal other than 0"),
+        ("p=point:0,0,0:0.1", "the nearest one lies within"),
     ],
 )
 def test_words_that_are_refused(text, match):
@@ -235,7 +235,7 @@ def test_words_that_are_refused(text, match):
 
 def test_a_surface_takes_its_name_too():
     model = sample_model(3)
-    with pytest.raises(InputError, match='"dark_surface" already'):
+    with pytest.raises(InputError, match='"dark_surface" exists already'):
         with_requested(
             model.mesh,
             Sets({"dark_surface": boundary_rows(model.mesh)}, {}),
@@ -246,7 +246,7 @@ def test_a_surface_takes_its_name_too():
 
 def test_below_needs_means():
     mesh = sample_model(3).mesh
-    with pytest.raises(InputError, match="has no means"):
+    with pytest.raises(InputError, match="has no cell means"):
         with_requested(mesh, Sets({}, {}), ["dark=below:12"], None)
 
 

@@ -32,7 +32,7 @@ def test_members_by_name():
     names = {2: "Left White", 41: "Right White", 3: "cortex", 42: "cortex"}
     merged = merge_labels(ROW, "white=Left White, right white; grey=cortex; 0:air=511", names)
     assert merged.labels.data.tolist() == [[0.0, 1.0, 1.0, 2.0, 2.0, 0.0]]
-    with pytest.raises(InputError, match='`merge`: label "cortx": no label is called so; did you mean cortex'):
+    with pytest.raises(InputError, match='`merge`: label "cortx": no label has this name; did you mean cortex'):
         merge_labels(ROW, "grey=cortx", names)
 
 
@@ -45,15 +45,15 @@ def test_members_by_name():
         ("white=2;;=3", 'got "=3"'),
         ("white=2,,3", 'got "white=2,,3"'),
         ("white=2=3", 'got "white=2=3"'),
-        ("white=2; white=3", "another name for each group, got white twice"),
-        ("white=2; 1:grey=3", "another label for each group, got 1 twice"),
+        ("white=2; white=3", "a different name for each group, got white twice"),
+        ("white=2; 1:grey=3", "a different label for each group, got 1 twice"),
         ("40000:white=2; rest=*", f"numbers of groups up to {LARGEST_LABEL}"),
-        ("white=*; grey=*", r"expected \* in one group"),
+        ("white=*; grey=*", r"expected \* in at most one group"),
         ("white=2,41; grey=3,40-42; rest=*", "label 41 is in two groups, white and grey"),
-        ("white=41-2; rest=*", "rising range of them, up to 32767, got 41-2"),
+        ("white=41-2; rest=*", "increasing range up to 32767, got 41-2"),
         ("white=2-99999; rest=*", "got 2-99999"),
-        ("white=1.5; rest=*", 'label "1.5": no label has a name'),
-        ("white=2,41", r"got none for 3, 42, 511; add them to a group, or give NAME=\*"),
+        ("white=1.5; rest=*", 'label "1.5": labels have no names'),
+        ("white=2,41", r"got no group for 3, 42, 511; add them to a group, or give NAME=\*"),
     ],
 )
 def test_groups_that_cannot_be(merge, match):
@@ -98,11 +98,11 @@ def test_rows_of_groups(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("white,2,41\ngrey", 'groups.csv: expected rows of a name and what it has, got "grey"'),
+        ("white,2,41\ngrey", 'groups.csv: expected rows of a name and values, got "grey"'),
         ("white,2\ngrey,", 'groups.csv: expected rows .* got "grey,"'),
         ("white,2,41\ngrey,41", "`merge`: label 41 is in two groups, white and grey"),
         ("name,labels\n", "groups.csv: `merge`: expected NAME=LABELS"),
-        ("5:white,2\n5:grey,41", "groups.csv: `merge`: expected another label for each group, got 5 twice"),
+        ("5:white,2\n5:grey,41", "groups.csv: `merge`: expected a different label for each group, got 5 twice"),
     ],
 )
 def test_other_rows_are_refused(tmp_path, text, match):

@@ -203,7 +203,7 @@ def test_what_came_of_a_part_is_made_again_if_it_is_damaged(copy, in_one_go):
 def test_a_damaged_state_is_said_in_a_line(copy, name, way):
     damaged(copy / name, way)
     with pytest.raises(
-        InputError, match=rf"^[^\n]*{name}: the file is damaged [^\n]*; remove {copy}, and run this again$"
+        InputError, match=rf"^[^\n]*{name}: the file is damaged [^\n]*; remove {copy} and run this again$"
     ):
         run(copy)
 
@@ -236,7 +236,7 @@ def test_a_state_of_other_words_is_said_in_a_line(folder, words):
 
 
 def test_a_folder_of_another_run_is_refused(folder):
-    with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run writes there [^\n]*$"):
+    with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run is writing there [^\n]*$"):
         run(folder)
 
 

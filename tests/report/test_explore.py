@@ -58,10 +58,10 @@ def test_a_field_is_the_first_within_limits(mesh, cell_data):
     assert (mean.limits, label.limits) == ((-5.0, 120.0), shown.fields[1].limits)
     np.testing.assert_array_equal(mean.values, shown.fields[0].values)
     for words, match in (
-        (("rho",), 'field: the mesh has no "rho"; it has mean, label'),
+        (("rho",), 'field: the mesh has no field "rho"; it has mean, label'),
         (("mean", (3.0, 3.0)), "range: expected LOW,HIGH with LOW below HIGH, got 3,3"),
         (("mean", (np.nan, 3.0)), "range: expected LOW,HIGH"),
-        (("label", (0.0, 3.0)), 'range: "label" are labels, which have a colour each'),
+        (("label", (0.0, 3.0)), 'range: "label" has labels, which have fixed colours'),
     ):
         with pytest.raises(InputError, match=match):
             opened_on(shown, *words)
@@ -129,11 +129,11 @@ def test_the_page_is_one_file(mesh, cell_data, tmp_path):
 
 def test_refusals(mesh, image):
     plane = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    with pytest.raises(InputError, match="expected a mesh of tetrahedra, got one of triangles"):
+    with pytest.raises(InputError, match="expected a tetrahedral mesh, got triangles"):
         exhibit(plane, {})
     with pytest.raises(InputError, match=f"'mean' for each of {len(mesh.cells)} cells, got 3"):
         exhibit(mesh, {"mean": np.zeros(3)})
-    with pytest.raises(InputError, match="3-D image beside a mesh of tetrahedra, got a 2-D one"):
+    with pytest.raises(InputError, match="3-D image for a tetrahedral mesh, got a 2-D one"):
         exhibit(mesh, {}, tetopt.Image(np.eye(3)))
     for nodes in (np.zeros((2, 4), dtype=int), np.zeros((2, 3)), np.zeros(3, dtype=int)):
         with pytest.raises(InputError, match="'top': expected \\(K, 3\\) whole numbers"):
@@ -563,8 +563,8 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)  # at rest
     assert page["grey"]  # nodes without a value
     second, first, none = page["reactions"]
-    assert second == "held by 1,235 mN: R 0, A 0.5, S 1,235"
-    assert first == "held by 5 mN: R 3, A -4, S 0"
+    assert second == "reaction 1,235 mN: R 0, A 0.5, S 1,235"
+    assert first == "reaction 5 mN: R 3, A -4, S 0"
     assert none == ""
 
 
@@ -622,4 +622,4 @@ def test_it_fits_a_narrow_window(shown):
 
 @pytest.mark.deep
 def test_without_webgl_it_is_said(shown):
-    assert "This browser has no WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]
+    assert "This browser does not support WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]

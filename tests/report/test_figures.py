@@ -594,8 +594,8 @@ def test_titles_say_how_many_nodes_and_how_good(monkeypatch, tmp_path, run):
 
 @pytest.mark.parametrize("name", ["a", "a.png.txt"])
 def test_a_picture_is_a_png_or_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
+    with pytest.raises(InputError, match=r"expected a name ending in \.png"):
         save_figure(Figure(), tmp_path / name)
-    with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
+    with pytest.raises(InputError, match=r"expected a name ending in \.png"):
         save_scenes(tmp_path / name, [("", lambda plotter: None)])
     assert list(tmp_path.iterdir()) == []

@@ -163,5 +163,5 @@ def test_its_bytes_are_few_and_always_the_same(tmp_path):
         save_thumbnail(tmp_path / f"{name}.png", image, mesh)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert (tmp_path / "a.png").stat().st_size < 20_000  # of noise, which no method makes smaller
-    with pytest.raises(InputError, match=r"ends in \.png"):
+    with pytest.raises(InputError, match=r"ending in \.png"):
         save_thumbnail(tmp_path / "a.jpg", image, mesh)

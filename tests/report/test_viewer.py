@@ -156,5 +156,5 @@ def test_a_browser_draws_cells_and_edges(page, tmp_path):
 @pytest.mark.deep
 def test_without_webgl_it_is_said(page, tmp_path):
     shown = document(copied(page.read_text(encoding="utf-8"), tmp_path / "copy.html", BLIND))
-    assert shown.count("This browser has no WebGL 2, so the 3-D view cannot be shown") >= 2
+    assert shown.count("This browser does not support WebGL 2, so the 3-D view cannot be shown") >= 2
     assert "<canvas" not in shown

@@ -77,7 +77,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     events = []
     with listened(events.append):
         outcome = run_in_child(pipes.crash_once, JOB, "mine", max_seconds=60.0)
-    assert events == [Event("note", "mine: crashed: signal 11, SIGSEGV; once more")]
+    assert events == [Event("note", "mine: crashed: signal 11, SIGSEGV; running it again")]
     assert (outcome.failure, outcome.reason) == (None, None)
     assert outcome.crashes == ("crashed: signal 11, SIGSEGV",)
     assert outcome.notes == ["the first run crashed: signal 11, SIGSEGV; this is the second", "a note"]

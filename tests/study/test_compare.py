@@ -225,10 +225,10 @@ def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
     assert by_k_D[0]["E_D_fraction"] > by_k_D[-1]["E_D_fraction"]
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert np.asarray(PIL.Image.open(out / "tradeoff.png").convert("L")).std() > 20.0
-    assert "What tetopt&#39;s options trade" in (out / "report.html").read_text()
+    assert "Trade-offs of tetopt&#39;s options" in (out / "report.html").read_text()
     assert main(["compare", *words, "--pipelines", "bcc", "--force"]) == 0
     assert not (out / "tradeoff.png").exists()
-    assert "options trade" not in (out / "report.html").read_text()
+    assert "Trade-offs" not in (out / "report.html").read_text()
 
 
 @pytest.mark.deep
@@ -241,16 +241,16 @@ def test_resume_keeps_what_is_done(run, head, undrawn, tmp_path, capsys):
     (out / "runs" / "bcc-400-1.json").unlink()
     capsys.readouterr()
     assert main(again) == 0
-    assert capsys.readouterr().err.count("kept from before") == 7
+    assert capsys.readouterr().err.count("finished before") == 7
     after = json.loads((out / "report.json").read_text())
     assert [p["median"]["E_D"] for p in after["pipelines"]] == [p["median"]["E_D"] for p in before["pipelines"]]
     assert main([*again, "--k-d", "0.3", "--pipelines", "bcc", "--curve", ""]) == 0
-    assert "kept from before" not in capsys.readouterr().err
+    assert "finished before" not in capsys.readouterr().err
     assert main([word for word in again if word != "--resume"]) == 2
     assert "exists already" in capsys.readouterr().err
     kept = (out / "report.json").read_bytes()
     assert main(["compare", inputs[0], "-o", str(out), "--nodes", "99", "--resume"]) == 2
-    assert "is of another comparison" in capsys.readouterr().err
+    assert "belongs to another comparison" in capsys.readouterr().err
     assert (out / "report.json").read_bytes() == kept
 
 
@@ -329,7 +329,7 @@ def test_when_all_fail_nothing_is_replaced(head, tmp_path, monkeypatch, capsys):
     """One line, exit 2, no report: without time for anything, and where no mesh can be measured."""
     words = [str(head / "image.nii.gz"), "-o", str(tmp_path / "out"), *SMALL, "--curve", "", "--pipelines", "bcc"]
     assert main(["compare", *words, "--max-seconds", "0.1"]) == 2
-    assert "every pipeline failed" in capsys.readouterr().err
+    assert "all pipelines failed" in capsys.readouterr().err
 
     def breaks(system):
         raise RuntimeError("no convergence")
@@ -397,13 +397,13 @@ def test_a_peer_that_crashes(head, undrawn, tmp_path, monkeypatch, capsys):
     words = ["baseline", image, "-o", str(tmp_path / "b.vtu"), "--nodes", "150", "--pipeline", "cleaver"]
     assert main(words) == 2
     err = capsys.readouterr().err
-    assert f"itk-cleaver: {crash}; once more" in err
+    assert f"itk-cleaver: {crash}; running it again" in err
     assert f"tetopt: itk-cleaver: twice {crash}" in err
     out = tmp_path / "out"
     words = [image, "-o", str(out), *SMALL, "--curve", "", "--pipelines", "tetopt,pytetwild,cleaver"]
     assert main(["compare", *words]) == 0
     said = capsys.readouterr()
-    assert said.err.count(f"{crash}; once more") == 3  # of the second also with quadratic cells
+    assert said.err.count(f"{crash}; running it again") == 3  # of the second also with quadratic cells
     title = "tetopt against pytetwild at 400 nodes; itk-cleaver failed twice (signal 11, SIGSEGV)"
     again = f"pytetwild: crashed once, and was run again ({crash})."
     report, page = json.loads((out / "report.json").read_text()), (out / "report.html").read_text(encoding="utf-8")
@@ -430,11 +430,11 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
         (["--pipelines", "tetopt,gmsh"], "pipelines: expected some of"),
         (["--pipelines", ""], "pipelines: expected some of"),
         (["--pipelines", "bcc,bcc"], "each once"),
-        (["--curve", "a"], "--curve: expected parts"),
+        (["--curve", "a"], "--curve: expected fractions"),
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),
         (["--max-seconds", "nan"], "--max-seconds: expected more than 0"),
-        (["--reference-seconds", "10"], "--reference-dofs sets the size of the reference already"),
+        (["--reference-seconds", "10"], "--reference-dofs already sets the size of the reference"),
         (["--young", "h-1000"], "--young: expected 0 kPa or more"),
         (["--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
     ],

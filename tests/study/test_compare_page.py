@@ -262,7 +262,7 @@ def pipelines_of(report, title):
     return report.quadratic if "quadratic" in title[0] else report.pipelines
 
 
-JUDGED = "Labels above 500 voxels, background 0 not counted"  # of the fake ones 1 and 2
+JUDGED = "Labels above 500 voxels, without background 0"  # of the fake ones 1 and 2
 DERIVED = {
     (JUDGED, "mean label Dice"): lambda rows: np.mean([r.dice for r in rows[1:3]]),
     (JUDGED, "smallest label Dice"): lambda rows: min(r.dice for r in rows[1:3]),
@@ -492,7 +492,7 @@ def test_who_keeps_the_labels_is_said(tmp_path):
     assert "is larger than" not in page
     page = flowing(page_of(tmp_path, with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62))._replace(labels=None)))
     assert "Dice is at least" not in page
-    assert "background 0 not counted" not in page
+    assert "without background 0" not in page
 
 
 @pytest.mark.parametrize(
@@ -584,7 +584,7 @@ def test_the_headline_is_a_handful_of_numbers(tmp_path):
     assert [texts[0][0] for texts in first.values()] == ["Image", "Image", "Shape", "Simulation", "Simulation", "Cost"]
     assert all(texts[2][-1] == "pytetwild" for texts in [*first.values(), *behind.values()])
     assert {texts[2][-1] for texts in others.values()} <= {"BCC lattice", "ODT, image-blind"}
-    assert all(re.match("does not see .{10}", texts[0][2]) for texts in first.values())
+    assert all(re.match("does not capture .{10}", texts[0][2]) for texts in first.values())
     assert not re.search(r"(best|loses) in \d+", page)
     titles = {criterion.title for criterion in criteria(report) if criterion.better == 0}
     assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', mean by voxels", "λ max"}
@@ -751,7 +751,7 @@ def test_without_a_peer_nothing_is_claimed(tmp_path):
     assert "pytetwild failed (out of time: killed after 4 s); " in headline(report).title
     report = fake_report()
     assert (
-        headline(report._replace(pipelines=report.pipelines[:1])).title == "tetopt against no peer: none was asked for"
+        headline(report._replace(pipelines=report.pipelines[:1])).title == "tetopt against no peer: none was requested"
     )
 
 
@@ -767,7 +767,7 @@ def test_tetopt_can_fail(tmp_path):
     report = fake_report()
     report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out", reason="limit"), [])
     page = page_of(tmp_path, report)
-    assert "<strong>nothing of tetopt&#39;s to compare: tetopt failed (timed out)</strong>" in page
+    assert "<strong>no mesh of tetopt&#39;s to compare: tetopt failed (timed out)</strong>" in page
     assert claims(page) == []
 
 

@@ -79,8 +79,8 @@ def test_lost_labels_and_specks_get_a_note():
     image = tetopt.Image(data)
     surfaces = interfaces(image, 6.0, labels=image)
     assert surfaces.notes == [
-        "labels: 1 specks of surface dropped",
-        "labels that vanish, every piece of their surface is a speck: 7",
+        "labels: dropped 1 specks of surface",
+        "lost labels, as every piece of their surface is a speck: 7",
     ]
 
 
@@ -88,7 +88,7 @@ def test_nothing_left_is_the_box():
     image = tetopt.Image(np.zeros((6, 7, 8)))
     surfaces = interfaces(image, 3.0, labels=image)
     assert len(surfaces.triangles) == surfaces.n_box == 12
-    assert surfaces.notes == ["no interface is left: only the box is meshed"]
+    assert surfaces.notes == ["no interface remains: only the box is meshed"]
 
 
 def test_class_labels_are_the_classes_of_the_surfaces():

@@ -11,7 +11,7 @@ IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 LABELS = tetopt.Image((IMAGE.data > 50) + 2 * (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 BOTH, ALONE = content(IMAGE, labels=LABELS), content(LABELS, labels=LABELS, weights=[0.0])
 EQUAL, AS_LABELS = (
-    "meshed from the image and the labels given, equally weighted",
+    "meshed from the image and the given labels, equally weighted",
     "the image is its labels: meshed as labels",
 )
 

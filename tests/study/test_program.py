@@ -98,9 +98,7 @@ def test_labels_go_to_the_program_and_come_back(tmp_path):
     n = len(made.mesh.cells)
     assert n < len(mesh.cells)
     np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
-    assert (
-        made.notes[-1] == f'{(number[:n] % 2 == 0).sum()} of {n} cells count for the "label" that its file gives them'
-    )
+    assert made.notes[-1] == f'{(number[:n] % 2 == 0).sum()} of {n} cells use the "label" in their file'
     assert by_program(JOB, program).labels is None
 
 
@@ -108,7 +106,7 @@ def test_other_suffixes(tmp_path):
     """gmsh's own format, and a mesh that no number steers: one run, and a note."""
     made = by_program(JOB, mesher(tmp_path, lattice(400), words="{image} {output}.msh"))
     n = len(made.mesh.points)
-    assert made.notes == ["1 runs", f"{n} nodes, 1000 were asked for; its runs gave {n}"]
+    assert made.notes == ["1 runs", f"{n} nodes, 1000 were requested; the runs gave {n}"]
     np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, IMAGE.data)
 
 
@@ -118,7 +116,7 @@ def test_a_count_that_cannot_be_met_is_told(tmp_path):
     made = by_program(JOB, mesher(tmp_path, mesh, mesh))
     n = len(mesh.points)
     first, *failures, last = made.notes
-    assert (first, last) == ("2 runs", f"{n} nodes, 1000 were asked for; its runs gave {n}, {n}")
+    assert (first, last) == ("2 runs", f"{n} nodes, 1000 were requested; the runs gave {n}, {n}")
     assert len(failures) == 3
     assert all("nodes: mine ended with exit code 1: cp: " in line for line in failures)
 
@@ -134,7 +132,7 @@ def test_a_boundary_near_the_box_is_put_on_it(shape):
 
 def test_a_boundary_far_from_the_box_stays():
     mesh, _, notes = boxed(IMAGE, scaled(lattice(300), -6))
-    assert notes == ["its boundary lies up to 3 voxels off the sides of the image's box"]
+    assert notes == ["its boundary lies up to 3 voxels from the sides of the image's box"]
     assert IMAGE.to_index(mesh.points).min() == pytest.approx(2.5)
 
 
@@ -143,7 +141,7 @@ def test_failures(tmp_path):
     for program, words in (
         (mesher(tmp_path, flat), "mine: expected tetrahedra, got triangles"),
         (mesher(tmp_path), "mine ended with exit code 1: cp: "),
-        (parse_program("mine=true {image} {output}"), "mine wrote no mesh, and wrote nothing on its standard error"),
+        (parse_program("mine=true {image} {output}"), "mine wrote no mesh, with nothing on its standard error"),
     ):
         with pytest.raises(tetopt.InputError, match=f"^{words}"):
             by_program(JOB, program)
@@ -181,7 +179,7 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     finally:
         command.kill()
     assert command.returncode == 143
-    assert "--resume goes on from there" in said
+    assert "continue with --resume" in said
     assert not is_running(int(pid_file.read_text()))
     wait_for(lambda: not list(temporary.iterdir()), 10.0)
     assert (tmp_path / "out" / "runs" / "bcc-150-1.json").is_file()
@@ -193,14 +191,14 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     [
         ("sh {image} {output}", "expected NAME='program"),
         ("a b=sh {image} {output}", "a name of letters"),
-        ("a=sh '{image} {output}", "its quotes do not match"),
+        ("a=sh '{image} {output}", "unbalanced quotes"),
         ("a=", "expected {output}, and {image}"),
         ("a=sh {output}", "expected {output}, and {image}"),
         ("a=sh {image}", "expected {output}, and {image}"),
         ("a=sh {image} {output} {seed}", "got {seed}"),
         ("a=sh {image} {output}.stl", "must be named .vtu, .vtk, .vtkhdf, .msh, .msh2, got {output}.stl"),
-        ("a=tetopt-no-such-program {image} {output}", 'no program "tetopt-no-such-program"'),
-        ("tetopt=sh {image} {output}", 'a pipeline named "tetopt" already'),
+        ("a=tetopt-no-such-program {image} {output}", 'no executable program "tetopt-no-such-program"'),
+        ("tetopt=sh {image} {output}", 'expected unique names, got "tetopt" again'),
     ],
 )
 def test_bad_commands(text, words, tmp_path, capsys):

@@ -53,13 +53,13 @@ def test_suffix_of_any_case(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a", "nii", "a.gz", "a.nii.gz.part"])
 def test_other_suffixes_are_refused(tmp_path, name):
-    assert_refused(tmp_path / name, "ends in .nii or .nii.gz", NIFTI, force=True)
+    assert_refused(tmp_path / name, "ending in .nii or .nii.gz", NIFTI, force=True)
 
 
 def test_an_existing_file_is_refused_without_force(tmp_path):
     path = tmp_path / "mesh.vtu"
     path.write_text("old")
-    assert_refused(path, "exists already; pass `force`")
+    assert_refused(path, "already exists; pass `force`")
     assert checked_output(path, VTU, force=True) == path
     assert path.read_text() == "old"
 
@@ -80,12 +80,12 @@ def test_a_folder_that_takes_no_file_is_refused(tmp_path, monkeypatch):
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(tempfile, "mkstemp", refused)
-    assert_refused(tmp_path / "mesh.vtu", "folder cannot be written to: Read-only file system")
+    assert_refused(tmp_path / "mesh.vtu", "folder is not writable: Read-only file system")
 
 
 @pytest.mark.parametrize("name", ["m" * 252 + ".vtu", "m\0.vtu"])
 def test_a_name_that_cannot_be_is_refused(tmp_path, name):
-    assert_refused(tmp_path / name, "cannot be written: (File name too long|embedded null)")
+    assert_refused(tmp_path / name, "cannot be written: (File name too long|.*embedded null)")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes in folders")
@@ -94,13 +94,13 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     assert_refused(tmp_path / "mesh.vtu", "found a device, a pipe", force=True)
     (tmp_path / "a.vtu").symlink_to("b.vtu")
     (tmp_path / "b.vtu").symlink_to("a.vtu")
-    assert_refused(tmp_path / "a.vtu", "a link in a circle|Too many levels", force=True)
+    assert_refused(tmp_path / "a.vtu", "a circular link|Too many levels", force=True)
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     for name in ("a" * 300, "a\0b", "file/b"):
-        with pytest.raises(InputError, match="the folder for the results cannot be made"), outputs_of_command():
+        with pytest.raises(InputError, match="cannot create the folder for the results"), outputs_of_command():
             results_folder(tmp_path / "new" / ".." / name)
     with pytest.raises(InputError, match="found a file"):
         results_folder(tmp_path / "file")
@@ -115,7 +115,7 @@ def test_a_link_is_written_through(tmp_path):
         link.symlink_to(Path("far") / name)
         if old is not None:
             target.write_text(old)
-        assert_refused(link, "exists already; pass `force`")
+        assert_refused(link, "already exists; pass `force`")
         checked_output(link, VTU, force=True)
         save_bytes(link, b"new")
         assert link.is_symlink()
@@ -152,7 +152,7 @@ def test_what_another_program_wrote_meanwhile_stays(tmp_path, monkeypatch, has_l
             checked_output(path, NIFTI)
             path.write_text("theirs")
             kept = tmp_path / f"a_kept_{number}.nii.gz"
-            with pytest.raises(TakenError, match=f"without `force` it stays.* is in {kept}"):
+            with pytest.raises(TakenError, match=f"as `force` is not set, and the output is in {kept}"):
                 save_bytes(path, b"ours")
         assert outputs.written == []
         assert path.read_text() == "theirs"
@@ -205,7 +205,7 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
     ):  # fmt: skip
         with outputs_of_command():
             name_files([None, 3, [Path(name) for name in named]])
-            assert_refused(Path(output), "is an input of this command too, or another output", force=True)
+            assert_refused(Path(output), "is also an input or another output of this command", force=True)
     with outputs_of_command():
         name_files([Path("a.vtu"), Path("b.vtu")])
         checked_output("a.vtu", VTU, force=True)
@@ -332,7 +332,7 @@ def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    words = r"cannot be written: No space left on device; it takes 3 bytes, \d+ are free"
+    words = r"cannot be written: No space left on device; it needs 3 bytes, \d+ are free"
     with pytest.raises(OSError, match=words) as caught:
         save_bytes(path, b"new")
     assert caught.value.filename == str(path)
@@ -342,7 +342,7 @@ def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch
 def test_space_is_asked_for(tmp_path):
     check_space(tmp_path / "a.vtu", 1)
     with pytest.raises(
-        InputError, match=r"a.vtu: takes some 1000000000000000000 bytes or more, \d+ are free; make room"
+        InputError, match=r"a.vtu: needs at least 1000000000000000000 bytes, \d+ are free; free some space"
     ):
         check_space(tmp_path / "a.vtu", 10**18)
 

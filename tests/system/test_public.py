@@ -148,7 +148,7 @@ def test_right_kinds_are_taken_and_wrong_ones_are_one_line(name):
 
 @pytest.mark.parametrize("what", ["a text", "nibabel's", "None"])
 def test_what_is_no_image_is_told_how_to_become_one(what):
-    with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; tetopt\.(load|Image)"):
+    with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; use tetopt\.(load|Image)"):
         tetopt.mesh_image(WRONG[what], 500)
 
 
@@ -182,7 +182,7 @@ def test_an_image_of_anything():
 
 
 def test_a_decorated_function_is_looked_at():
-    with pytest.raises(tetopt.InputError, match=r"^solve: model: expected Model, got .*; tetopt\.build_model"):
+    with pytest.raises(tetopt.InputError, match=r"^solve: model: expected Model, got .*; use tetopt\.build_model"):
         tetopt.solve("x.vtu")
 
 

@@ -74,7 +74,7 @@ def test_what_is_not_tetopts_is_one_line_and_stays(work, name, kind):
     planted(kind, work / name, elsewhere)
     before = content(work.parent)
     create(work, LAYOUT)
-    with pytest.raises(InputError, match=rf"^{work / name.partition('/')[0]}[^\n]*; move it away, and run this again$"):
+    with pytest.raises(InputError, match=rf"^{work / name.partition('/')[0]}[^\n]*; move it away and run this again$"):
         checked(work)
     assert content(work.parent) == before
     discard(work, LAYOUT)
@@ -103,7 +103,7 @@ def test_without_its_manifest_it_is_not_ours(work, manifest):
         (work / "tetopt-manifest").write_bytes(manifest.encode() if isinstance(manifest, str) else manifest)
     before = content(work)
     create(work, LAYOUT)
-    with pytest.raises(InputError, match=rf"^{work}[^\n]*; move it away, and run this again$"):
+    with pytest.raises(InputError, match=rf"^{work}[^\n]*; move it away and run this again$"):
         checked(work)
     assert content(work) == before
 
@@ -111,7 +111,7 @@ def test_without_its_manifest_it_is_not_ours(work, manifest):
 def test_a_lock_with_a_second_name_is_not_written_to(work):
     elsewhere = outside(work.parent)
     planted("hard link", work / "lock", elsewhere)
-    with pytest.raises(InputError, match=rf"^{work / 'lock'}: expected a file of one name"):
+    with pytest.raises(InputError, match=rf"^{work / 'lock'}: expected a file without hard links"):
         locked(work)
     assert (elsewhere / "notes.txt").read_text() == "years of work"
 
@@ -119,7 +119,7 @@ def test_a_lock_with_a_second_name_is_not_written_to(work):
 def test_a_lock_says_whose_it_is(work):
     with ExitStack() as stack:
         stack.enter_context(opened(work, LAYOUT)).lock(stack, "lock", is_shared=False, what="it")
-        with pytest.raises(InputError, match=r"^it: another run writes there \(process \d+ on "):
+        with pytest.raises(InputError, match=r"^it: another run is writing there \(process \d+ on "):
             locked(work)
     locked(work)
 

@@ -26,7 +26,7 @@ from tetopt.system.budget import check_addresses
 from tetopt.system.files import Outputs, outputs_of_command
 from tetopt.system.interpreter import THREADS_NAME
 
-# In the order of the help, with the modules that have NAME_command: only that of the command that runs is loaded.
+# Commands in the order of the help, with the modules that define NAME_command; only the running command's is loaded.
 COMMANDS = {
     "mesh": "mesh",
     "cohort": "cohort",
@@ -53,10 +53,10 @@ ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
 
 
 class _Plain:
-    """A part of the command line whose help has nothing beside switches, which take no value."""
+    """A part of the command line whose help shows no metavar beside switches, which take no value."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The parameters, switches without a name for a value."""
+        """Return the parameters, with the metavar removed from switches."""
         parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for each in parameters:
             if getattr(each, "is_flag", False):
@@ -73,27 +73,27 @@ class _Group(_Plain, TyperGroup):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; the exit code.
+    """Run the command and return the exit code.
 
-    0: done; 1: the mesh violates a requirement; 2: an input to mend, or an output that could not be written, standard
-    output among them; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
+    0: done; 1: the mesh violates a requirement; 2: an invalid input, or an output, including standard output, that
+    could not be written; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
     """
-    # What commands load are 400,000 objects that stay: seldom gone through for cycles, 0.1 s, nor at the end, 0.25 s.
+    # Commands load 400,000 objects that stay: fewer collections save 0.1 s, and none at exit 0.25 s.
     gc.set_threshold(*COLLECTED_AT)
     atexit.register(gc.freeze)
     open_streams()
     with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard(), listened(show_event):
         warnings.showwarning = show_warning
-        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice does not concern the user
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)
     if reason := settle_streams():
-        show_error(f"standard output: cannot be written: {reason}; what was printed is incomplete")
+        show_error(f"standard output: cannot be written: {reason}; the printed output is incomplete")
         code = code or 2
     return code
 
 
 def _run(arguments: list[str], outputs: Outputs) -> int:
-    """Run the command; the exit code. What went wrong is said, and what was written in spite of it."""
+    """Run the command and return the exit code; print errors, and the outputs written in spite of them."""
     try:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
         return _ended_by_signal(outputs) if code in (INTERRUPTED_CODE, signal_code()) else code
@@ -105,7 +105,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         return ended.exit_code
     except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
         return _ended_by_signal(outputs)
-    except SystemExit:  # what typer and rich answer to a pipe that has closed, in which their help was to go
+    except SystemExit:  # typer and rich exit so if the pipe for their help has closed
         return 0
     except Exception as error:
         if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
@@ -119,8 +119,8 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
 
 
 def _with_option(message: str, arguments: list[str]) -> str:
-    """A message that begins with an argument's name, as the library's do, perhaps after a file's: with the option that
-    the user gave for it."""
+    """Replace the argument's name that begins a message of the library, perhaps after a file's, by the option that the
+    user gave for it."""
     parts = message.split(": ")
     for place, name in enumerate(parts[:2]):
         option = f"--{ARGUMENT_OPTIONS.get(name, name).replace('_', '-')}"
@@ -130,21 +130,21 @@ def _with_option(message: str, arguments: list[str]) -> str:
 
 
 def _ended_by_signal(outputs: Outputs) -> int:
-    """Say what has ended the command, and what is there all the same; the exit code."""
+    """Print which signal ended the command and which outputs exist; return the exit code."""
     names = ", ".join(map(str, outputs.written)) or "nothing"
-    written = f"; written: {names}" if outputs.places else ""  # without any, the command has said what is there
+    written = f"; written: {names}" if outputs.places else ""  # without any, the command has printed what exists
     log.print(escape(f"ended by {signal_name()}{written}"))
     return signal_code()
 
 
 def _say_written(outputs: Outputs) -> None:
-    """The outputs that are there although the command ended early."""
+    """Print the outputs that exist although the command ended early."""
     if outputs.written:
-        log.print(escape(f"written all the same: {', '.join(map(str, outputs.written))}"))
+        log.print(escape(f"written before the error: {', '.join(map(str, outputs.written))}"))
 
 
 def _app(arguments: Sequence[str]) -> typer.Typer:
-    """The command line, of whose commands only the one that the arguments name can run; the others are names."""
+    """Build the command line; only the command that the arguments name is loaded, the others are placeholders."""
     app = typer.Typer(
         name="tetopt",
         help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
@@ -166,27 +166,27 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def help_line(name: str) -> str:
-    """Return the first line of a command's docstring, from the text of its module, which takes a second to load."""
+    """Return the first line of a command's docstring, read from its module's source, as importing it takes a second."""
     source = Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
     return source.partition(f"def {name.replace('-', '_')}_command(")[2].split('"""')[1].splitlines()[0]
 
 
 def loaded_command(name: str) -> Callable[..., Any]:
-    """Return the function of a command, as typer takes it.
+    """Return the function of a command in the form that typer expects.
 
     Raises
     ------
     InputError
-        The libraries that it loads have no room, or numba cannot have the threads that the environment asks for.
+        There is no room for the libraries that it loads, or the environment's number of threads is invalid.
     """
     check_addresses()
     threads = os.environ.get(THREADS_NAME, "").strip()
     if threads and not (threads.isdecimal() and len(threads) <= MOST_DIGITS and int(threads) >= 1):
         raise InputError(
             f"{THREADS_NAME}: expected a whole number of threads from 1 to {10**MOST_DIGITS - 1}, got "
-            f"{threads[:20]}; set it to one, or unset it"
+            f"{threads[:20]}; set a valid number, or unset it"
         )
-    from tetopt.cli.options import from_records  # which loads what its defaults come from
+    from tetopt.cli.options import from_records  # this import loads the modules of its defaults
 
     return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command"))
 

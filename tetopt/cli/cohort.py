@@ -1,4 +1,4 @@
-"""``tetopt cohort``: many subjects, each as `tetopt mesh` alone would mesh it, on the workers of a cluster."""
+"""``tetopt cohort``: many subjects, each meshed as by `tetopt mesh`, on the workers of a cluster."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from tetopt.system.budget import memory_words
 def cohort_command(
     context: typer.Context,
     subjects: Annotated[
-        Path, Option("SUBJECTS", "A table, .tsv or .csv: subject, image, ...; or a BIDS folder.", is_argument=True)
+        Path, Option("SUBJECTS", "A .tsv or .csv table (subject, image, ...), or a BIDS folder.", is_argument=True)
     ],
     cohort: CohortOptions,
     options: RunOptions,
 ) -> int:
-    """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
+    """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
     try:
         plan = plan_cohort(subjects, cohort, options)
     except Problems as problems:
         for line in problems.lines:
             show_error(line)
-        log.print(f"nothing was run: {len(problems.lines)} to mend")
+        log.print(f"nothing was run; problems to fix: {len(problems.lines)}")
         return 2
     if cohort.write_table is not None:
         out.print(escape(f"{cohort.write_table}: {len(plan.entries)} subjects"))
@@ -57,27 +57,27 @@ def cohort_command(
 
 
 def _say_estimate(plan: CohortPlan) -> None:
-    """What would be run, and what it takes."""
+    """Print which subjects would be run, with their time and memory."""
     to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
     for entry in to_run:
         if (one := estimate.get(entry.key)) is None:
-            out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
+            out.print(escape(f"{entry.key}: size unknown, as its image cannot be read"))
         else:
-            out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
+            out.print(escape(f"{entry.key}: {one.seconds:.0f} s on one thread, {memory_words(one.peak_bytes)}"))
     seconds = sum(one.seconds for one in estimate.values())
     peak = max((one.peak_bytes for one in estimate.values()), default=0.0)
-    whole = f"in all {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
+    whole = f"in total {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
-        out.print(f"{whole}; divided by as many as the cluster runs at a time" if to_run else "nothing to run")
+        out.print(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
     out.print(f"{whole}; on this machine {n_workers} at a time: about {time_words(seconds / n_workers)}")
 
 
 class _CohortDisplay:
-    """The listener of a cohort: a bar on a terminal, else a line for each subject; in the end what there is.
+    """The listener of a cohort: a bar on a terminal, else a line for each subject; a summary at the end.
 
-    `code` is then the exit code, and `arguments` are told to go on with, if there are any.
+    `code` is then the exit code; `arguments`, if any, are shown as the command that resumes the run.
     """
 
     def __init__(self, plan: CohortPlan, arguments: Sequence[str]) -> None:
@@ -106,7 +106,7 @@ class _CohortDisplay:
             show_event(event)
 
     def _show(self, at: CohortProgress, line: str) -> None:
-        """Show how a subject ended."""
+        """Show a subject's outcome."""
         about = "" if at.seconds_left is None else f", about {time_words(at.seconds_left)} left"
         words = f"{at.n_failed} failed{about}"
         if not log.is_terminal:
@@ -117,7 +117,7 @@ class _CohortDisplay:
         self._bar.update(self._bar.task_ids[0], advance=1, words=words)
 
     def _close(self, rows: Sequence[Row]) -> None:
-        """Say what there is."""
+        """Print the summary of all subjects."""
         place, keys = self._plan.place, set(self._plan.keys)
         own = [row for row in rows if row.key in keys]
         counts = Counter[str](row.status for row in own)
@@ -126,11 +126,11 @@ class _CohortDisplay:
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
         out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
-            more = f"{counted(n_more, 'subject')} more in {place}, from other tables, are shown with these"
+            more = f"the page also shows {counted(n_more, 'subject')} more in {place}, from other tables"
             log.print(escape(more))
         for name in (PAGE_NAME, TABLE_NAME):
             out.print(escape(str(place / name)))
         self.code = int(bool(counts["failed"] or counts["missing"]))
         if self.code and self._arguments:
             words_again = " ".join(map(shlex.quote, self._arguments))
-            log.print(escape(f"to go on with what is missing or failed, and with that alone: tetopt {words_again}"))
+            log.print(escape(f"to run only the missing and failed subjects again: tetopt {words_again}"))

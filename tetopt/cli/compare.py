@@ -1,4 +1,4 @@
-"""``tetopt baseline``, ``compare`` and ``paper``: beside the conventional pipelines, and beside the paper."""
+"""``tetopt baseline``, ``compare`` and ``paper``: comparisons with the conventional pipelines and with the paper."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def paper_command(
     seeds: Annotated[int, Option("N", "Random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
-    """Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours."""
+    """Reproduce the paper's figures and table: paper.json, pictures, a page with each printed number beside ours."""
     from tetopt.study.paper_files import reproduce
 
     page, seconds = reproduce(output, image, labels, seeds, force)
@@ -42,7 +42,7 @@ def baseline_command(
     options: BaselineOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
+    """Mesh an image the conventional way, for comparison: segment, extract surfaces, tetrahedralise."""
     from tetopt.study.baseline import baseline
 
     made = baseline(image_path, output, options, numbers.json_path, numbers.force)
@@ -62,14 +62,14 @@ def compare_command(
     resume: Annotated[bool, Option(None, "Keep the finished runs of an interrupted comparison.")] = False,
     force: ForceOption = False,
 ) -> int:
-    """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
+    """Compare tetopt with the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
     from tetopt.study.compare_files import compare_image
 
     command = f"tetopt {' '.join(map(shlex.quote, context.obj))}"
     try:
         report = compare_image(image_path, output, options, command, resume=resume, force=force)
     except KeyboardInterrupt:
-        log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
+        log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs; continue with --resume")
         return 130
     _print_headline(headline(report))
     n_pipelines = len(report.options.pipelines)
@@ -78,7 +78,7 @@ def compare_command(
 
 
 def _print_headline(first: Headline) -> None:
-    """The page's first section: who was compared, the few numbers, where tetopt is behind, and what to know of it."""
+    """Print the page's first section: the pipelines, the main numbers, where tetopt is behind, and remarks."""
     out.print(escape(first.title))
     for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
         if claims:

@@ -1,4 +1,4 @@
-"""What the commands say: `log` on standard error, `out`, the result, on standard output. Neither ends a run."""
+"""Output of the commands: `log` on standard error, `out`, the result, on standard output. Neither ends a run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from tetopt.job.events import Event
 
 WIDEST_TABLE = 500  # characters in a line
-LONGEST_ERROR = 480  # characters: what to do stands at the end, what came may be a line of a million
-PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls them
+LONGEST_ERROR = 480  # characters: the remedy stands at the end, the value found may be a line of a million
+PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command line's names
     **{
         name: f"--{name.replace('_', '-').lower()}"
         for name in (
@@ -36,7 +36,7 @@ OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments 
 
 
 class _Stream:
-    """A stream that takes what it can: letters that it has not as escapes, and nothing more once a write has failed."""
+    """A stream that escapes characters it cannot encode, and discards everything once a write has failed."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -45,13 +45,13 @@ class _Stream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write, if it can be; the number of letters."""
+        """Write if possible; return the number of characters."""
         encoding = getattr(self._stream, "encoding", None) or "utf-8"
         self._try(lambda: self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding)))
         return len(text)
 
     def flush(self) -> None:
-        """Flush, if it can be."""
+        """Flush if possible."""
         self._try(self._stream.flush)
 
     def _try(self, action: Any) -> None:
@@ -61,16 +61,16 @@ class _Stream:
             if error.errno != errno.EPIPE and self._stream is sys.stdout:
                 _unprinted.append(error.strerror or str(error))
             _silence(self._stream)
-        except (ValueError, RuntimeError):  # closed; written to by what a signal has interrupted
+        except (ValueError, RuntimeError):  # closed, or written to by the code that a signal interrupted
             pass
 
 
-_unprinted: list[str] = []  # why standard output has not taken what was printed
+_unprinted: list[str] = []  # reasons why standard output lost text
 
 
 def _silence(stream: Any) -> None:
-    """Let the rest of what goes to a stream, and what waits in its buffer, go nowhere."""
-    with suppress(OSError, ValueError, AttributeError):  # a stream of a program that has put its own in the place
+    """Discard a stream's buffer and all that is written to it later."""
+    with suppress(OSError, ValueError, AttributeError):  # the stream was replaced by a program's own
         number = stream.fileno()
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, number)
@@ -82,7 +82,7 @@ class _Console(Console):
 
     @property
     def file(self) -> IO[str]:
-        """The stream, by whose failures nothing ends."""
+        """The stream, whose failures end nothing."""
         stream: Any = super().file
         return stream if isinstance(stream, _Stream) else _Stream(stream)  # type: ignore[return-value]
 
@@ -91,7 +91,7 @@ class _Console(Console):
         self._file = new_file
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text of a message or a table, in which names of files may hold anything."""
+        """Render a text of a message or a table, with control characters, as of file names, shown."""
         return super().render_str(plain(text), **options)
 
 
@@ -100,22 +100,22 @@ out = _Console(highlight=False, soft_wrap=True, emoji=False)
 
 
 def open_streams() -> None:
-    """Put the null device where standard input, output or error is closed.
+    """Open the null device in place of closed standard input, output or error.
 
-    Else the next file that is opened takes their number, and with it what libraries print.
+    Otherwise the next file that is opened takes their number and receives the libraries' output.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest free number: this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest free number is this one
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, as long as the process
 
 
 def settle_streams() -> str | None:
-    """Flush the streams, so that Python has nothing left to fail at its end; why standard output lost something."""
+    """Flush the streams, so that Python cannot fail at exit; return the reason why standard output lost text."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             _Stream(stream).flush()
@@ -125,20 +125,20 @@ def settle_streams() -> str | None:
 
 
 def show_error(message: object) -> None:
-    """Say what is wrong, on one line that is not endless, with the command's names for options."""
+    """Print an error on one line of limited length, with the command's names for options."""
     line = plain(in_options(str(message)))
-    if len(line) > LONGEST_ERROR:  # of a file's own words
+    if len(line) > LONGEST_ERROR:  # it quotes a file
         line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 3 :]}"
     log.print(f"[bold red]tetopt:[/] {escape(line)}")
 
 
 def in_options(message: str) -> str:
-    """A message of the library with the command's options for its arguments, at its head and between backticks."""
+    """Replace a message's names of arguments, at its head and between backticks, by the command's options."""
     return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], with_hyphens(message))
 
 
 def with_hyphens(message: str) -> str:
-    """A message with the command's options for the arguments between backticks."""
+    """Replace a message's arguments between backticks by the command's options."""
     if "`" not in message:
         return message
     from tetopt.job.options import JobOptions, kinds_of, option_name
@@ -148,12 +148,12 @@ def with_hyphens(message: str) -> str:
 
 
 def say(text: str) -> None:
-    """Say a line of the library."""
+    """Print a line of the library."""
     log.print(escape(with_hyphens(text)))
 
 
 def show_event(event: Event) -> None:
-    """Say a note, a warning, or a requirement that is not met."""
+    """Print a note, a warning, or a violated requirement."""
     if event.kind == "note":
         say(event.text)
     elif event.kind == "warning":
@@ -163,23 +163,23 @@ def show_event(event: Event) -> None:
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Say a warning on one line; also in place of `warnings.showwarning`."""
+    """Print a warning on one line; replaces `warnings.showwarning`."""
     log.print(f"[yellow]tetopt: warning:[/] {escape(plain(with_hyphens(str(message))))}")
 
 
 def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> None:
-    """How well sizes, contrasts, mask and labels are met, as far as `measured` has them (`tetopt.report.summary`).
+    """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured` (`tetopt.report.summary`).
 
-    `ndim` is the mesh's; `word` is what the mask is called.
+    `ndim` is the mesh's dimension; `word` is the name of the mask.
     """
-    # numba and more come with these
+    # these import numba and more
     from tetopt.report.tables import label_differences, label_table, mask_table, sizes_in_words
 
     if "edges_over_target" in measured:
         out.print(escape(sizes_in_words(measured["edges_over_target"])))
     for row in measured.get("contrasts", []):
         fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
-        out.print(escape(f"{row['image']}: weight {row['weight']:g}, fraction of its own variance in cells {fraction}"))
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, fraction of its variance within cells {fraction}"))
     if "mask" in measured:
         print_wide(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:
@@ -191,7 +191,7 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> N
 
 
 def _print_thin(measured: dict[str, Any], ndim: int) -> None:
-    """The thinnest labels in cells, and contact of labels that is too large."""
+    """Print the thinnest labels, in cells, and false contacts of labels."""
     from tetopt.report.tables import contact_table, contacts_in_words, thin_table
 
     names = measured.get("label_names", {})
@@ -204,6 +204,6 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
 
 
 def print_wide(table: Table) -> None:
-    """A table as wide as it is, also where a pipe has no width."""
+    """Print a table at its full width, also into a pipe, which has no width."""
     width = out.measure(table, options=out.options.update(width=WIDEST_TABLE)).maximum
     _Console(file=out.file, width=max(out.width, width), highlight=False, emoji=False).print(table)

@@ -21,12 +21,12 @@ def convert_command(
     mesh_path: MeshArgument,
     output: Annotated[Path, Option("OUT", f"The file to write: {', '.join(FORMATS)}.", is_argument=True)],
     image_path: Annotated[
-        Path | None, Option("IMAGE", "Take means and mappings from this image, not from the mesh's file.", "image")
+        Path | None, Option("IMAGE", "Use this image's means and mappings, not the mesh file's.", "image")
     ] = None,
-    mask_path: Annotated[Path | None, Option("MASK", "With `image`: only what lies in it counts.", "mask")] = None,
+    mask_path: Annotated[Path | None, Option("MASK", "With `image`: use only voxels in the mask.", "mask")] = None,
     results_path: Annotated[
         Path | None,
-        Option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (VTK's formats).", "results"),
+        Option("JOB.frd", "Add CalculiX's results for this mesh (VTK formats only).", "results"),
     ] = None,
     *,
     part: LabelledPart,
@@ -47,7 +47,7 @@ def convert_command(
 
 
 def _show(event: Event) -> None:
-    """Show an event; how large results are is what was asked for."""
+    """Show an event; the magnitudes of results go to standard output."""
     if event.kind == "progress":
         out.print(escape(event.text))
     else:

@@ -1,4 +1,4 @@
-"""How a command ends before its time: Ctrl-C, SIGTERM, which schedulers send, and SIGHUP, of a terminal that closes."""
+"""Early ends of a command: Ctrl-C, SIGTERM, which schedulers send, and SIGHUP, which a closing terminal sends."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 from tetopt.cli.console import log
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-SIGNAL_CODE = 128  # and a signal's number: the exit code that shells give to what it ended
-INTERRUPTED_CODE = SIGNAL_CODE + signal.SIGINT  # what commands and typer return after any of them
+SIGNAL_CODE = 128  # plus a signal's number: the exit code that shells give to a process it ended
+INTERRUPTED_CODE = SIGNAL_CODE + signal.SIGINT  # commands and typer return it after any of them
 
 
 class _Ending:
-    """The signals that came, and whether the next one is to be waited with: one of them for the whole process."""
+    """The signals received, and whether the next one is deferred: one instance for the whole process."""
 
     def __init__(self) -> None:
         self.numbers: list[int] = []
@@ -25,10 +25,10 @@ class _Ending:
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
         self.numbers.append(number)
         if self.is_deferred and len(self.numbers) == 1:
-            log.print("interrupted: finishing the current nodes, then writing the mesh (again to give up)")
+            log.print("interrupted: finishing the current nodes, then writing the mesh (interrupt again to discard it)")
             return
         if self.is_deferred:
-            log.print("interrupted again: what is not yet written is given up")
+            log.print("interrupted again: unwritten results are discarded")
         raise KeyboardInterrupt
 
 
@@ -37,9 +37,9 @@ _ending = _Ending()
 
 @contextmanager
 def signals_heard() -> Iterator[None]:
-    """Within it the first signal raises KeyboardInterrupt, or, within `mesh_kept`, only `is_ended`.
+    """Handle signals: the first raises KeyboardInterrupt, or, within `mesh_kept`, only makes `is_ended` true.
 
-    A signal that is ignored remains so, as SIGHUP under nohup and SIGINT in the background.
+    An ignored signal remains ignored, as SIGHUP under nohup and SIGINT in the background.
     """
     before: dict[Any, Any] = {}
     _ending.numbers.clear()
@@ -59,7 +59,7 @@ def signals_heard() -> Iterator[None]:
 
 @contextmanager
 def mesh_kept() -> Iterator[Callable[[], None]]:
-    """Once the function that it gives was called, there is a mesh: the first signal waits until that is written."""
+    """Defer the first signal until the mesh is written, once the function that this yields has been called."""
 
     def begin() -> None:
         _ending.is_deferred = True
@@ -71,16 +71,16 @@ def mesh_kept() -> Iterator[Callable[[], None]]:
 
 
 def is_ended() -> bool:
-    """Whether a signal has asked for the end."""
+    """Return whether a signal has requested the end."""
     return bool(_ending.numbers)
 
 
 def signal_name() -> str:
-    """What has ended the command, in words."""
+    """Return the name of the signal that ended the command."""
     code = signal_code()
     return "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name
 
 
 def signal_code() -> int:
-    """The exit code after the first signal that came, that of Ctrl-C if none did."""
+    """Return the exit code for the first signal received, or that of Ctrl-C if there was none."""
     return SIGNAL_CODE + _ending.numbers[0] if _ending.numbers else INTERRUPTED_CODE

@@ -20,7 +20,7 @@ from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
 from tetopt.system.files import checked_output
 
-SHOWN_FRACTION = 1e-9  # of a force's largest component: less is what an iterative solution leaves
+SHOWN_FRACTION = 1e-9  # of a force's largest component: less is the residual of an iterative solution
 
 
 def fem_command(
@@ -28,13 +28,13 @@ def fem_command(
         list[Path],
         Option(
             "[IMAGE] MESH",
-            "VTU, VTK or MSH file; with moduli and loads it needs no more. Mappings are of IMAGE's intensities.",
+            "VTU, VTK or MSH file, sufficient with moduli and loads; modulus mappings use IMAGE's intensities.",
             is_argument=True,
         ),
     ],
     compress: Annotated[
         float | None,
-        Option("PERCENT", f"Push the bottom in by this much, the top held (with IMAGE by default {PAPER_PERCENT:g})."),
+        Option("PERCENT", f"Push the bottom in by this much, the top fixed (default with IMAGE {PAPER_PERCENT:g})."),
     ] = None,
     conditioning: Annotated[
         bool | None,
@@ -54,9 +54,9 @@ def fem_command(
 ) -> int:
     """Solve a mesh with its loads: displacements, stresses, strain energy, reactions.
 
-    Linear elasticity, small displacements; in 2-D plane stress, 1 mm thick. Each step is a load case of its own.
-    Without loads, and with IMAGE, it is the paper's test: the face of the image's box with the largest z (in 2-D y) is
-    held and the one opposite pushed in, both bonded; without --young intensities are the moduli.
+    Linear elasticity, small displacements; in 2-D plane stress, 1 mm thick. Each step is an independent load case.
+    With IMAGE and without loads, this is the paper's test: the face of the image's box with the largest z (y in 2-D)
+    is fixed and the opposite face pushed in, both bonded; without --young the intensities are the moduli.
     """
     if len(paths) > 2:
         raise InputError(f"expected [IMAGE] MESH, got {len(paths)} files")
@@ -65,7 +65,7 @@ def fem_command(
     if output is not None:
         output = checked_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
-        raise InputError("--sets: no file is written; give -o SOLVED.vtu, too")
+        raise InputError("--sets: no file is written; add -o SOLVED.vtu")
     came = solve_file(
         mesh_path, images[0] if images else None, output, model=model, part=part, compress=compress,
         conditioning=conditioning,
@@ -76,13 +76,13 @@ def fem_command(
 
 
 def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
-    """Rows that tell what the moduli are of: the mapping, how it was averaged, the ratios."""
+    """Yield rows on the moduli: the mapping, its average, Poisson's ratios."""
     model, options, nu = came.model, came.options, came.numbers["materials"]["nu"]
-    yield "modulus mapping", "of the mesh's file" if options.young is None else escape(options.young)
+    yield "modulus mapping", "from the mesh's file" if options.young is None else escape(options.young)
     if model.node_young is not None:
         yield "modulus within a cell", "linear between its nodes"
     elif model.gauss_young is not None:
-        yield "modulus within a cell", "one around each Gauss point"
+        yield "modulus within a cell", "one per Gauss point"
     elif options.average is not None and not isinstance(parse_any_mapping(str(options.young)), ByLabel):
         yield "average over a cell", options.average
     low, high = nu.min(), nu.max()
@@ -90,7 +90,7 @@ def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
 
 
 def _print(name: str, came: SolvedModel) -> None:
-    """A table of a column for each step."""
+    """Print a table with a column for each step."""
     model, solutions, extremes = came.model, came.solutions, came.extremes
     steps = [f"step {step}" for step in range(1, len(solutions) + 1)] if len(solutions) > 1 else [""]
     table = new_table(escape(name), *steps)
@@ -120,6 +120,6 @@ def _print(name: str, came: SolvedModel) -> None:
 
 
 def _vector(force: NDArray[np.float64]) -> str:
-    """The components of a force; what is rounding beside the largest is 0."""
+    """Format the components of a force; those within rounding of the largest are 0."""
     shown = np.where(np.abs(force) > SHOWN_FRACTION * np.abs(force).max(), force, 0.0)
     return ", ".join(f"{part:.6g}" for part in shown)

@@ -27,7 +27,7 @@ from tetopt.system.files import results_folder
 
 
 def mesh_command(job: Job, predict: PredictOption = False) -> int:
-    """Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU."""
+    """Mesh an image: nodes where it has detail (or a uniform lattice), optimised, as VTU or for a solver."""
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         if predict:
             return _predict(job, display)
@@ -38,7 +38,7 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
 
 
 def _predict(job: Job, display: Display) -> int:
-    """Say what the run will take."""
+    """Print the time and memory that the run will take."""
     with listened(display):
         task = read(job)
         display.end_stage()
@@ -49,7 +49,7 @@ def _predict(job: Job, display: Display) -> int:
 def _print(result: Result) -> None:
     """Print the comparison.
 
-    Everything is written by now, as what is printed may go into a pipe that closes.
+    All files are written before, as standard output may be a pipe that closes.
     """
     task, model, measured = result.task, result.model, result.measured
     job = task.plan.job
@@ -72,9 +72,9 @@ def _print_comparison(result: Result, n_empty: int) -> None:
     table = new_table("", result.task.start_name, "optimised")
     is_tense = result.optimized.labels is not None  # as soon as cells have labels
     table.add_row("E, combined, + tension at the end" if is_tense else "E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
-    table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
+    table.add_row("E_G, relative to initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
-        table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
+        table.add_row("E_D, relative to initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         table.add_row(
             f"E_D, fraction of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
@@ -85,17 +85,17 @@ def _print_comparison(result: Result, n_empty: int) -> None:
     if first_shape is not None and last_shape is not None:
         add_quality(table, first_shape, last_shape, in_all=in_all)
     if n_empty:
-        table.add_row("cells that hold no voxel centre", "", str(n_empty))
+        table.add_row("cells without a voxel centre", "", str(n_empty))
     out.print(table)
 
 
 def demo_command(
     output: Annotated[Path, Option("DIR", "Folder for the results.", letter="o")] = Path("demo"),
-    nodes: Annotated[int, Option("N", "Wanted number of nodes.")] = DEFAULT_NODES[3],
+    nodes: Annotated[int, Option("N", "Target number of nodes.")] = DEFAULT_NODES[3],
     iterations: Annotated[int | None, Option("I", "Sweeps over all nodes.", least=0)] = None,
     force: ForceOption = False,
 ) -> int:
-    """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
+    """Mesh the MNI152 T1 that comes with nilearn; write mesh, numbers and pictures to a folder."""
     folder = results_folder(output)
     return mesh_command(
         Job(

@@ -1,7 +1,7 @@
-"""Options of the commands, as records of annotated fields, and how typer takes them.
+"""Options of the commands, as records of annotated fields, and their conversion for typer.
 
-A command is a function of records; `from_records` makes of it the function of single options that typer wants, each
-record's options in a panel of the help. The help's words stand here alone.
+A command is a function of records; `from_records` turns it into the function of single options that typer expects,
+with each record's options in a panel of the help.
 """
 
 from __future__ import annotations
@@ -35,50 +35,50 @@ ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
     Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra or triangles.", is_argument=True)
 ]
-PredictOption = Annotated[bool, Option(None, "Tell how long the run takes and how much memory, and write nothing.")]
+PredictOption = Annotated[bool, Option(None, "Predict the run's time and memory, and write nothing.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumberOptions:
-    """The file of all numbers beside what a command prints."""
+    """The file of all numbers of a command."""
 
     json_path: JsonOption = None
     force: ForceOption = False
 
     def check(self) -> None:
-        """InputError if the file may not be written."""
+        """Raise InputError if the file may not be written."""
         if self.json_path is not None:
             checked_output(self.json_path, (".json",), self.force)
 
     def save(self, numbers: dict[str, Any]) -> None:
-        """Write the file, if there is to be one."""
+        """Write the file if it was requested."""
         if self.json_path is not None:
             save_json(self.json_path, numbers)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShownOptions:
-    """How `tetopt view` shows a mesh, and where."""
+    """View settings of `tetopt view`, and its outputs."""
 
-    html: Annotated[Path | None, Option("OUT.html", "Write the page there, and open no browser.")] = None
-    screenshot: Annotated[Path | None, Option("OUT.png", "Write how it opens as a picture, and open no browser.")] = (
+    html: Annotated[Path | None, Option("OUT.html", "Write the page to this file; open no browser.")] = None
+    screenshot: Annotated[Path | None, Option("OUT.png", "Write the initial view as a picture; open no browser.")] = (
         None
     )
     field: Annotated[
-        str | None, Option("NAME", "Colour by this at first: mean, label, von_mises, ... (default: the first).")
+        str | None, Option("NAME", "Field to colour by initially: mean, label, von_mises, ... (default: the first).")
     ] = None
     limits: Annotated[
         str | None,
-        Option("LOW,HIGH", "What its colours go from and to (default: all but 1 % at either end).", "range"),
+        Option("LOW,HIGH", "Range of its colours (default: all but 1 % at either end).", "range"),
     ] = None
     label_names: LabelNamesOption = None
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:
-    """The command as a function of single options, for typer: the fields of its records in the records' places.
+    """Convert a command to a function of single options, for typer: records are replaced by their fields.
 
-    A record is a dataclass; the records in it count as part of it. Its `panel`, if it has one, is the title of its
-    options in the help.
+    A record is a dataclass; nested records are part of it. Its `panel`, if any, is the title of its options in the
+    help.
     """
     kinds = get_type_hints(command, include_extras=True)
     defaults = {name: each.default for name, each in inspect.signature(command).parameters.items()}
@@ -88,7 +88,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
         name_files(values.values())
         for name, value in values.items():
             if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-                raise InputError(f"{name.replace('_', '-')}: expected a number that 64 bits hold, got a longer one")
+                raise InputError(f"{name.replace('_', '-')}: expected a number of 64 bits, got a larger one")
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     leaves = [each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)]
@@ -104,7 +104,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
 
 
 def _leaves(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[tuple[str, Any, Any, str | None]]:
-    """What stands for a parameter of a command, or for a field of a record: names, kinds, defaults and panels."""
+    """Yield the single options of a command's parameter or a record's field: names, kinds, defaults and panels."""
     if not is_dataclass(kind):
         yield name, kind, default, panel
         return
@@ -116,13 +116,13 @@ def _leaves(name: str, kind: Any, default: Any, panel: str | None = None) -> Ite
 
 
 def _panel_of(record: type, name: str) -> str | None:
-    """The panel of the help that a field of a record stands in: that of the first class with one that brings it."""
+    """Return the help panel of a record's field: that of the first class that defines the field and has a panel."""
     bringing = [each for each in reversed(record.__mro__) if name in getattr(each, "__dataclass_fields__", {})]
     return next((each.panel for each in bringing if hasattr(each, "panel")), None)
 
 
 def _typed(name: str, kind: Any, panel: str | None) -> Any:
-    """The annotation as typer takes it, its option in a panel of the help; arguments have one of their own."""
+    """Return the annotation for typer, with the option's help panel; arguments have a panel of their own."""
     if not has_option(kind):
         return kind
     own = option_of(kind)
@@ -134,7 +134,7 @@ def _typed(name: str, kind: Any, panel: str | None) -> Any:
 
 
 def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
-    """A parameter's value: one of `values`, or the record that is made of them."""
+    """Return a parameter's value: one of `values`, or a record built from them."""
     if not is_dataclass(kind):
         return values[name]
     kinds = kinds_of(cast(type, kind))

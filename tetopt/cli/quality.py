@@ -19,15 +19,15 @@ from tetopt.report.tables import add_quality, new_table
 
 def quality_command(
     mesh: Annotated[Path, Option("MESH", "VTU, VTK or MSH file of tetrahedra or triangles.", is_argument=True)],
-    image: Annotated[Path | None, Option("IMAGE", "Measure E_D against this image, too.")] = None,
-    mask: Annotated[Path | None, Option("MASK", "How well the boundary follows it; with `image`.")] = None,
-    labels: Annotated[Path | None, Option("LABELS", "How well cells keep to them; with `image`.")] = None,
+    image: Annotated[Path | None, Option("IMAGE", "Also measure E_D against this image.")] = None,
+    mask: Annotated[Path | None, Option("MASK", "Compare the boundary with this mask; needs `image`.")] = None,
+    labels: Annotated[Path | None, Option("LABELS", "Compare cells with these labels; needs `image`.")] = None,
     check: Annotated[
         bool,
         Option(
             None,
-            "Is it a mesh, with a manifold boundary? With `image`, does it fill the box, and meet what its run was "
-            "asked for? Exit 1 if not.",
+            "Check for a valid mesh with a manifold boundary and, with `image`, that it fills the box and meets its "
+            "run's requirements; exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,
@@ -53,14 +53,14 @@ def quality_command(
 
 
 def _checked_words(came: Judgement) -> str:
-    """What a mesh that is sound was looked at for besides."""
+    """Describe what else a valid mesh was checked for."""
     if came.is_masked:
-        return "; made within a mask, which may have several components"
+        return "; meshed within a mask, which may have several components"
     return ", in one piece" + (", fills the box" if came.source is not None and came.is_filled else "")
 
 
 def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str]) -> None:
-    """Rows of how well cells fit an image, without what the run that made the mesh had besides."""
+    """Add rows on how well cells fit an image, and name the inputs of the mesh's run that are left out."""
     table.add_row("E_D", f"{fit.E_D:.6g}")
     if fit.E_D_fraction_of_variance is not None:
         words = f", without its {' and '.join(left_out)}" if left_out else ""

@@ -1,4 +1,4 @@
-"""A run as a terminal shows it: what it is at, its progress, the clock."""
+"""Display of a run in a terminal: its stage, its progress, the clock."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from tetopt.job.events import Event, Stage
 from tetopt.job.in_parts import PartsProgress
 from tetopt.system.budget import memory_words, resident_bytes
 
-LINE_SECONDS = 10.0  # between lines, where there is no terminal to show a bar on
+LINE_SECONDS = 10.0  # between lines, if there is no terminal for a bar
 
 
 class Display:
-    """The listener of a run: each stage has its bar or status on a terminal, and lines from time to time elsewhere.
+    """The listener of a run: each stage has its bar or status on a terminal, and occasional lines elsewhere.
 
-    `begin_keeping` is called as soon as there is a mesh that is worth keeping.
+    `begin_keeping` is called as soon as there is a mesh worth keeping.
     """
 
     def __init__(self, begin_keeping: Callable[[], None]) -> None:
         self._begin_keeping = begin_keeping
         self._shown = ExitStack()
-        self._violated: list[Event] = []  # said last of all, where they are seen
+        self._violated: list[Event] = []  # printed last, where they are seen
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
-        self._n_rows = 0  # of the iterations so far; 0 while there are none
+        self._n_rows = 0  # iterations so far; 0 if there are none
         self._say = rare_lines()
 
     def end_stage(self) -> None:
-        """End what is shown of a stage."""
+        """End the display of a stage."""
         self._shown.close()
 
     def close(self) -> None:
-        """End what is shown, and say which requirements are violated."""
+        """End the display, and print the violated requirements."""
         self.end_stage()
         while self._violated:
             show_event(self._violated.pop(0))
@@ -61,7 +61,7 @@ class Display:
             show_event(event)
 
     def is_over(self) -> bool:
-        """Whether a signal has asked for the end; between iterations, a line says from time to time how far it is."""
+        """Return whether a signal has requested the end; within an iteration, print its progress from time to time."""
         if self._n_rows:
             self._say(f"  in iteration {self._n_rows}, {_spent(time.perf_counter() - self._begin)}")
         return is_ended()
@@ -90,21 +90,21 @@ class Display:
 
 @contextlib.contextmanager
 def compiling(title: str) -> Iterator[Callable[[str], None]]:
-    """A function that shows how far compiling is: a terminal's status, which begins with `title`, else lines."""
+    """Yield a function that shows the progress of compiling: a terminal's status beginning with `title`, else lines."""
     begin = time.perf_counter()
     with log.status(f"{title} ...") as status:
         say = rare_lines(is_first_said=True)
 
         def progress(words: str) -> None:
             status.update(f"{words} ...")
-            say(f"{words} (of the first run only), {time.perf_counter() - begin:.0f} s")
+            say(f"{words} (first run only), {time.perf_counter() - begin:.0f} s")
 
         yield progress
 
 
 @contextlib.contextmanager
 def waiting(words: str) -> Iterator[None]:
-    """Show that something is being done: a terminal's status, else a line from time to time."""
+    """Show that work is in progress: a terminal's status, else occasional lines."""
     begin, is_done = time.perf_counter(), threading.Event()
 
     def lines() -> None:
@@ -125,7 +125,7 @@ def waiting(words: str) -> Iterator[None]:
 
 
 def rare_lines(is_first_said: bool = False) -> Callable[[str], None]:
-    """A function that prints lines where there is no terminal, at most one in `LINE_SECONDS`."""
+    """Return a function that prints lines if there is no terminal, at most one per `LINE_SECONDS`."""
     last = -np.inf if is_first_said else time.perf_counter()
 
     def say(words: str) -> None:
@@ -145,7 +145,7 @@ def _spent(seconds: float) -> str:
 
 @contextlib.contextmanager
 def _bar(iterations: int) -> Iterator[Callable[[IterationRecord], None]]:
-    """A function that shows each record: a bar with the remaining time on a terminal, else a line."""
+    """Yield a function that shows each record: a bar with the remaining time on a terminal, else a line."""
     first: list[IterationRecord] = []
 
     def words(row: IterationRecord) -> str:
@@ -169,12 +169,12 @@ def _bar(iterations: int) -> Iterator[Callable[[IterationRecord], None]]:
 
 @contextlib.contextmanager
 def _parts_bar(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Event], None]]:
-    """A function that shows how far a run in parts is: a bar on a terminal, else lines."""
+    """Yield a function that shows the progress of a run in parts: a bar on a terminal, else lines."""
     say, number = rare_lines(), -1
 
     def words(at: PartsProgress) -> str:
         now, history = at
-        kind = {"measure": "measuring", "improve": f"round {now.number}", "fields": "fields of cells"}[now.kind]
+        kind = {"measure": "measuring", "improve": f"round {now.number}", "fields": "cell fields"}[now.kind]
         energies = f", E {history[-1].E:.4f}" if history else ""
         return f"{kind} of {now.n_rounds - 2}{energies}" if now.kind == "improve" else f"{kind}{energies}"
 

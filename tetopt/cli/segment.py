@@ -23,15 +23,15 @@ def segment_command(
     image_path: ImageArgument,
     mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or MSH file over the image.", is_argument=True)],
     output: Annotated[Path, Option("LABELS.nii.gz", "The labels to write.", letter="o")],
-    classes: Annotated[int, Option("K", "Number of classes, by rising mean.", least=2)] = 4,
+    classes: Annotated[int, Option("K", "Number of classes, in order of increasing mean.", least=2)] = 4,
     truth_path: Annotated[
-        Path | None, Option("LABELS", "True labels: print the Dice overlap with them.", "truth")
+        Path | None, Option("LABELS", "True labels; prints the Dice overlap with them.", "truth")
     ] = None,
     *,
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
-    """Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels."""
+    """Segment an image by its mesh, fast and roughly: group cells by mean into K classes and label their voxels."""
     from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
@@ -49,10 +49,8 @@ def segment_command(
         "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "fraction_of_voxels": fractions,
         "mean_intensity": means,
     }  # fmt: skip
-    names = {} if truth is None else stands_for(labels, truth)  # of labels, by class
-    table = new_table(
-        "class", "fraction of the voxels", "mean intensity", *([] if truth is None else ["stands for label"])
-    )
+    names = {} if truth is None else stands_for(labels, truth)  # labels by class
+    table = new_table("class", "fraction of voxels", "mean intensity", *([] if truth is None else ["matched label"]))
     for number, (fraction, mean) in enumerate(zip(fractions, means, strict=True)):
         last = [] if truth is None else [str(names.get(number, "none"))]
         table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
@@ -62,7 +60,7 @@ def segment_command(
         overlap = {"mesh": by_mesh, "voxels": by_voxels}
         report |= {"truth": truth_path.name, "stands_for": names, "dice": overlap}
         if lost := [str(label) for label in by_mesh if label not in names.values()]:
-            show_warning(f"no class stands for label {', '.join(lost)}: its Dice is 0; try more --classes")
+            show_warning(f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes")
         for label in by_mesh:
             overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
     save_image(output, labels)
@@ -75,14 +73,14 @@ def segment_command(
 
 
 def _mesh_over(path: Path, image: Image, image_path: Path) -> Mesh:
-    """The mesh of a file, whose cells hold each of the image's voxels once; a warning tells of voxels outside."""
+    """Read a mesh whose cells contain each of the image's voxels at most once; warn of voxels outside."""
     loaded = read_mesh(path)
     warn_of_other_image(loaded, path, image_path)
     if (overlap := overlap_of(image, loaded.mesh)) is not None:
-        raise InputError(f"{path}: {overlap}; remove one of each such pair, or mesh the image again")
+        raise InputError(f"{path}: {overlap}; remove one cell of each pair, or mesh the image again")
     outside = int((tetopt.cell_of_voxel(image, loaded.mesh) < 0).sum())
     if outside == image.data.size:
-        raise InputError(f"{path}: no voxel of {image_path} lies in it; was it made from another image?")
+        raise InputError(f"{path}: the mesh contains no voxel of {image_path}; was it built from another image?")
     if outside:
         show_warning(f"{outside} of {image.data.size} voxels lie outside the mesh and get class 0")
     return loaded.mesh

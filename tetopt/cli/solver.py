@@ -1,4 +1,4 @@
-"""What the commands say of a file for a solver."""
+"""Summary lines and tables for a solver's file."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from tetopt.model.model import Model, element_facets, elements
 from tetopt.report.tables import new_table, nodes_in_words
 
 GMSH_SUFFIXES = (".msh", ".msh2")
-CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # what the formats call the number of a cell
+CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word for the number of a cell
 
 
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
-    """What is in the file: sets, materials and the error of binning, units, coordinates."""
+    """Print the contents of the file: sets, materials and the error of binning, units, coordinates."""
     for line in _lines(output, model, solver):
         out.print(escape(line))
     if format_of(output).is_surface:
@@ -41,7 +41,7 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
 
 
 def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
-    """A line for each material with the names of its labels, where labels have names and each is of one material."""
+    """Yield a line for each material with its labels, if labels have names and each has one material."""
     labels, names = labels_of(model.cell_data, len(model.mesh.cells)), table_of_words(model.about.get(TABLE_TEXT)).names
     if labels is None or not names:
         return
@@ -54,15 +54,15 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
 
 
 def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
-    """What gmsh's formats cannot hold as it is: loads, label 0, and, in 2.2, a facet in several groups."""
+    """Yield lines on what gmsh's formats cannot store: loads, label 0, and, in 2.2, a facet in several groups."""
     if model.loads:
-        yield f"loads are not read back from {suffix}: tetopt reads them from VTK files only"
+        yield f"loads in {suffix} files are not read back; tetopt reads loads from VTK files only"
     labels = labels_of(model.cell_data, len(model.mesh.cells))
     if labels is not None and labels.min() == 0:
         yield f"label 0 is physical group {group_of_zero(labels)}, as gmsh has no group 0"
     if suffix == ".msh2" and (short := incomplete_groups(model)):
         yield (
-            f"gmsh 2.2 has one group per facet: those of smaller sets are missing from {', '.join(short)} (use .msh)"
+            f"gmsh 2.2 has one group per facet: facets of smaller sets are missing from {', '.join(short)} (use .msh)"
         )
 
 
@@ -77,26 +77,26 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield from _materials_by_name(model, materials)
     if materials is not None and model.gauss_young is not None:
         yield (
-            f"one modulus a cell, its geometric mean, and, for tetopt fem, one at each Gauss point ({GAUSS_MODULI})"
+            f"one modulus per cell, its geometric mean, and, for tetopt fem, one per Gauss point ({GAUSS_MODULI})"
             if output.suffix.lower() in VTK_SUFFIXES
-            else "one modulus a cell, its geometric mean; VTK's files have one at each Gauss point, too"
+            else "one modulus per cell, its geometric mean; VTK files also have one per Gauss point"
         )
     if materials is not None and materials.binning is not None:
         mean, largest = materials.binning.mean, materials.binning.largest
-        yield f"bins: modulus off by {mean:.2%} in the mean by volume, {largest:.2%} at most"
+        yield f"bins: modulus error {mean:.2%} on average by volume, {largest:.2%} at most"
     if model.node_young is not None and not form.is_surface:
         low, high = model.node_young.min(), model.node_young.max()
         yield (
             f"the modulus is linear within cells, {low:.4g} to {high:.4g} kPa at their corners"
             if form.has_node_moduli
-            else "the format has one modulus a cell: the mean of what is linear between the corners"
+            else "the format has one modulus per cell: the mean of the linear modulus"
         )
     for load in () if form.is_surface else model.loads:
         yield f"load: {load_words(load, SHOWN_LOAD_DIGITS)}"
     if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
-        yield "the format runs no step: its loads are text, if it has them"
+        yield "the format defines no analysis step: it has loads as text, if at all"
     if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:

@@ -33,9 +33,9 @@ def view_command(
     part: BoxPart,
     force: ForceOption = False,
 ) -> int:
-    """Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in the browser.
+    """View a mesh or its results in the browser: cut, colour by any field, threshold, deform.
 
-    A mesh with displacements is drawn deformed, by a factor that a slider changes; of quadratic cells the corners are.
+    A mesh with displacements is drawn deformed, scaled by a slider; quadratic cells are drawn by their corners.
     """
     html = None if how.html is None else checked_output(how.html, (".html",), force)
     screenshot = None if how.screenshot is None else checked_output(how.screenshot, (".png",), force)
@@ -46,14 +46,14 @@ def view_command(
     if image_path is not None:
         image = read_image(image_path, part)
         if image.ndim != mesh.ndim:
-            raise InputError(f"{image_path}: expected a {mesh.ndim}-D image, as the mesh is, got a {image.ndim}-D one")
+            raise InputError(f"{image_path}: expected a {mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
-    from tetopt.report.exhibit import (  # matplotlib and pyvista are slow to load, and only needed here
+    from tetopt.report.exhibit import (  # matplotlib and pyvista load slowly and are needed only here
         exhibit,
         opened_on,
     )
@@ -71,18 +71,19 @@ def view_command(
         page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
         save_explorer(page, shown)
         words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
-        out.print(escape(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, needs nothing else"))
+        out.print(escape(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained"))
     return 0
 
 
 def _is_opened(page: Path) -> bool:
-    """Open a page in the browser; whether there is one. On Linux without a screen it would be one in this terminal."""
+    """Open a page in the browser, and return whether it opened; on Linux without a screen none opens, as it would be
+    one in this terminal."""
     has_screen = not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     return bool(has_screen) and webbrowser.open(page.as_uri())
 
 
 def _limits(text: str) -> tuple[float, float]:
-    """The two numbers of --range."""
+    """Parse the two numbers of --range."""
     parts = text.split(",")
     if len(parts) != 2:
         raise InputError(f'--range: expected LOW,HIGH, such as 0,120, got "{text}"')
@@ -90,9 +91,9 @@ def _limits(text: str) -> tuple[float, float]:
 
 
 def _only_labels(loaded: MeshFile) -> str | None:
-    """The field of labels, if the file says that the mesh was made of these alone: means of their numbers tell little.
+    """Return the field of labels if the mesh was built from labels alone, as means of label numbers are meaningless.
 
-    A mesh with results on its nodes opens on these.
+    A mesh with results on its nodes opens with these.
     """
     weights = table_in(loaded, "inputs").get("weights")
     are_alone = isinstance(weights, list) and len(weights) > 0 and not any(weights)
@@ -100,7 +101,7 @@ def _only_labels(loaded: MeshFile) -> str | None:
 
 
 def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
-    """The forces that hold sets, mN by step, that a file of `tetopt fem` states."""
+    """Return the reactions of sets, mN, by step, from a file of `tetopt fem`."""
     reactions = {}
     for key in loaded.field_data:
         match = re.fullmatch(r"reactions(?:_step(\d{1,9}))?", key)
@@ -109,7 +110,7 @@ def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
         try:
             by_set = json_of(loaded.text(key) or "{}")
             forces = {str(name): [float(x) for x in force] for name, force in by_set.items() if len(force) == 3}
-        except (TypeError, ValueError, AttributeError):  # another program's
+        except (TypeError, ValueError, AttributeError):  # written by another program
             continue
         if np.isfinite([*forces.values()]).all():
             reactions[int(match[1] or 1)] = forces

@@ -1,4 +1,4 @@
-"""``tetopt warm-up``: compile all kernels ahead."""
+"""``tetopt warm-up``: compile all kernels in advance."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from tetopt.fem.reference import reference
 from tetopt.system.cache import place_cache
 from tetopt.system.kernels import link, roots
 
-BALL_VOXELS = 24  # along each axis of the image that is meshed: an octree of 300 nodes needs as many
-BALL_NODES = {2: 60, 3: 300}  # by its axes
+BALL_VOXELS = 24  # along each axis of the meshed image: an octree of 300 nodes needs this many
+BALL_NODES = {2: 60, 3: 300}  # by number of axes
 
 
 def warm_up_command() -> int:
-    """Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache."""
+    """Compile all kernels in advance, as for a container image or a cluster; later runs load them from the cache."""
     place = place_cache()
     if place.notice is not None:
-        raise InputError(f"warm-up: nothing can be kept: {place.notice}")
+        raise InputError(f"warm-up: compiled kernels cannot be stored: {place.notice}")
     begin = time.perf_counter()
     with compiling("compiling all kernels, a minute on two cores") as progress:
         link(roots(), progress)
@@ -40,12 +40,12 @@ def warm_up_command() -> int:
             _mesh_balls(n)
         reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)
     seconds = time.perf_counter() - begin
-    out.print(escape(f"all kernels are ready after {seconds:.0f} s, kept in {place.folder}"), soft_wrap=True)
+    out.print(escape(f"all kernels are ready after {seconds:.0f} s, stored in {place.folder}"), soft_wrap=True)
     return 0
 
 
 def _mesh_balls(n: int) -> None:
-    """Tiny meshes of all kinds, and what is measured of them: what no kernel calls is compiled with its caller."""
+    """Build and measure tiny meshes of all kinds, which compiles functions that no kernel calls."""
     radius = np.sqrt(((np.indices((BALL_VOXELS,) * n) - 0.5 * (BALL_VOXELS - 1)) ** 2).sum(axis=0))
     balls = Image((radius < 0.4 * BALL_VOXELS) + 1.0 * (radius < 0.2 * BALL_VOXELS))
     nodes = BALL_NODES[n]

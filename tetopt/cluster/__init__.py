@@ -1,1 +1,1 @@
-"""Dask's workers, here or on a cluster, and the tasks that they are given."""
+"""Dask workers, here or on a cluster, and their tasks."""

@@ -1,4 +1,4 @@
-"""What is needed of dask's workers, what there is of them, and what is looked at when one comes."""
+"""Requirements of dask workers, the workers themselves, and the checks of new ones."""
 
 from __future__ import annotations
 
@@ -16,71 +16,71 @@ from tetopt.system.budget import memory_words
 from tetopt.system.child import end_with_parent, limit_self
 
 MEMORY_MARGIN = 1.35  # of a task's memory over its prediction, which may be 25 % too low: 1 / 0.75
-WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and what they exchange
-# The same of one that runs tasks itself: 240 MB with all kernels loaded, its nanny, zarr and buffers of threads.
+WORKER_BYTES = 1.5e8  # of a dask worker with its nanny: 65 MB each, and their messages
+# Of a worker that runs tasks itself: 240 MB with all kernels loaded, its nanny, zarr and buffers of threads.
 WITHIN_BYTES = 4e8
-# Of its limit, at which a nanny ends a worker: 5 % are left for what is taken until it looks again, 0.1 s later.
+# Of its limit, where a nanny ends a worker: 5 % remain for allocations until the next check, 0.1 s later.
 TERMINATE_FRACTION = 0.95
-# Dask's configuration of its own scheduler: a worker that dies fails its task at once.
+# Configuration of dask's scheduler: a worker that dies fails its task at once.
 SCHEDULER_SETTINGS = {"distributed.scheduler.allowed-failures": 0}
-# Where workers run tasks themselves: these hold nothing that dask could put elsewhere, so that there is one limit, and
-# a process that is in a kernel, which lets no other thread of Python run, is not taken for dead.
+# For workers that run tasks themselves: dask cannot move their data elsewhere, so there is one limit; and a process in
+# a kernel, which blocks other Python threads, does not count as dead.
 WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")} | {
     "distributed.worker.memory.terminate": TERMINATE_FRACTION,
     "distributed.scheduler.worker-ttl": None,
 }
-# Dask's own port, which its users know, or another where that is taken; to this machine only: it shows tasks' names.
+# Dask's usual port, or another if that is in use; only for this machine, as it shows tasks' names.
 DASHBOARD_ADDRESS = "127.0.0.1:8787"
 
 
 class Need(NamedTuple):
-    """What is needed of workers."""
+    """Requirements of workers."""
 
-    n_tasks: int  # that are to be run
-    task_bytes: float  # of the largest, predicted, 0 if nothing is known
-    threads: int | None  # for each task, None: its part of the cores
-    is_within: bool = False  # tasks are run by the workers themselves, in whose processes kernels stay loaded
-    most_bytes: float | None = None  # of a worker of this machine, which its tasks share
+    n_tasks: int  # to run
+    task_bytes: float  # of the largest, predicted; 0 if unknown
+    threads: int | None  # per task; None: its fraction of the cores
+    is_within: bool = False  # workers run tasks in their own processes, where kernels stay loaded
+    most_bytes: float | None = None  # of a worker on this machine, shared by its tasks
 
     def settings(self) -> dict[str, Any]:
-        """Of dask's configuration, where its scheduler is ours."""
+        """Return settings of dask's configuration for tetopt's own scheduler."""
         return SCHEDULER_SETTINGS | (WITHIN_SETTINGS if self.is_within else {})
 
     def limit_for(self, task_bytes: float) -> float:
-        """Memory of a worker whose task may take so much, bytes."""
+        """Return the memory of a worker for a task of this size, bytes."""
         if self.is_within:
             return (task_bytes + WITHIN_BYTES) / TERMINATE_FRACTION
         return task_bytes + WORKER_BYTES
 
     def room_of(self, limit: float) -> float:
-        """Memory for the task of a worker that has so much in all, bytes."""
+        """Return the memory for a task of a worker with this total, bytes."""
         return max(0.0, limit * TERMINATE_FRACTION - WITHIN_BYTES if self.is_within else limit - WORKER_BYTES)
 
 
 class Folders(NamedTuple):
-    """Where workers put what they need."""
+    """Folders of workers."""
 
     work: Path  # temporary files; every worker must see it
-    logs: Path  # what dask and the batch system's jobs have to say
+    logs: Path  # output of dask and of the batch system's jobs
 
 
 class Workers(NamedTuple):
-    """Workers that run, or that have been asked for."""
+    """Running or requested workers."""
 
     client: Any  # distributed.Client
-    slots: Callable[[], int]  # how many tasks may run now; asked again as long as there are some to begin
+    slots: Callable[[], int]  # returns the number of tasks that may run now; called again while tasks wait
     threads: int  # for each task
-    bytes: float  # memory that one task may take, infinite if nothing is known
+    bytes: float  # memory for one task; infinite if unknown
     words: str  # one line to print
-    limit: float = float("inf")  # memory of a worker in all
+    limit: float = float("inf")  # total memory of a worker
 
 
 class About(NamedTuple):
-    """What a worker says of itself."""
+    """A worker's description of itself."""
 
     version: str  # of tetopt
     python: str
-    probe: str | None  # what it reads in the client's folder
+    probe: str | None  # content that it reads in the client's folder
     host: str
     cores: int
     n_threads: int
@@ -88,7 +88,7 @@ class About(NamedTuple):
 
     @classmethod
     def of(cls, probe: Path, dask_worker: Any = None) -> About:
-        """That of the process that calls it, in a worker by `distributed.Client.run`."""
+        """Describe the calling process, in a worker by `distributed.Client.run`."""
         from dask.system import CPU_COUNT
 
         try:
@@ -108,7 +108,7 @@ class About(NamedTuple):
 
 
 class Newcomers:
-    """Workers that have been looked at, so that each is once: a cluster's come and go."""
+    """Checked workers, so that each is checked once, as a cluster's workers come and go."""
 
     def __init__(self, client: Any, need: Need, folder: Path) -> None:
         self.client, self.need = client, need
@@ -118,20 +118,20 @@ class Newcomers:
         self.probe.write_text(self.token, encoding="ascii")
 
     def slots(self) -> int:
-        """The threads of all workers that are there, of which those not yet seen are looked at first."""
+        """Return the number of threads of all workers, after a check of new ones."""
         threads = self.client.nthreads()
         new = [address for address in threads if address not in self.known]
         if new:
             answers = self.client.run(About.of, self.probe, workers=new, on_error="return")
             for address, about in sorted(answers.items()):
-                if isinstance(about, OSError):  # it has gone meanwhile
+                if isinstance(about, OSError):  # it has ended meanwhile
                     continue
                 self._check(address, about)
                 self.known[address] = about
         return sum(threads.values())
 
     def room_of(self, about: About) -> float:
-        """Memory that one task may take there, bytes."""
+        """Return the memory for one task there, bytes."""
         share = about.n_bytes / about.n_threads
         return self.need.room_of(share) if self.need.is_within else share
 
@@ -153,7 +153,7 @@ class Newcomers:
                 )
         if about.probe != self.token:
             raise InputError(
-                f"worker {address} on {about.host}: does not see {self.probe.parent}; "
+                f"worker {address} on {about.host}: cannot access {self.probe.parent}; "
                 "expected an output folder on a file system that all workers share"
             )
         if self.need.is_within and about.n_threads > 1:  # kernels take all of a process's threads
@@ -167,17 +167,16 @@ class Newcomers:
             advice = f"dask worker --nthreads {fitting}" if fitting else "a larger --memory-limit"
             raise InputError(
                 f"worker {address} on {about.host}: has {memory_words(share)} for each of {about.n_threads} tasks, "
-                f"the largest needs about {memory_words(self.need.task_bytes)}; start it with {advice}"
+                f"but the largest needs about {memory_words(self.need.task_bytes)}; start it with {advice}"
             )
 
 
 def beginning(is_within: bool, log: Path | None = None) -> Any:
-    """A plugin that sets up workers as they begin, also those that are started again.
+    """Return a plugin that sets up workers as they start or restart.
 
-    With `is_within` an allocation that would take a worker over its limit of memory fails, where systems have that, and
-    a worker ends with its nanny, whatever it does just then. A nanny ends its worker after the fact, when it next
-    looks. RLIMIT_DATA counts what the process may write to and has not got from a file, touched or not; files' pages,
-    which can be had again, count for the nanny alone. What a worker would write to the terminal goes to the end of
+    With `is_within`, an allocation beyond a worker's memory limit fails, on systems that support it, and a worker ends
+    with its nanny. A nanny ends its worker only later, at its next check. RLIMIT_DATA counts writable memory not
+    backed by files, touched or not; pages of files count only for the nanny. A worker's terminal output is appended to
     `log`.
     """
     from distributed import WorkerPlugin
@@ -198,10 +197,10 @@ def beginning(is_within: bool, log: Path | None = None) -> Any:
 
 
 def dashboard_link(client: Any) -> str:
-    """The page that answers there; dask's own words have the scheduler's name in it."""
+    """Return the dashboard's local address; dask's own link contains the scheduler's name."""
     return f"http://127.0.0.1:{client.scheduler_info()['services']['dashboard']}/status"
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things in words."""
+    """Format a number of things."""
     return f"{number} {noun}{'s' * (number != 1)}"

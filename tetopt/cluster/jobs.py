@@ -1,7 +1,7 @@
-"""Jobs of a batch system as dask's workers, by dask-jobqueue and in its own configuration.
+"""Jobs of a batch system as dask workers, by dask-jobqueue and with its configuration.
 
-A job runs one task at a time, or `processes` of them, and what it asks for is what the largest task is predicted
-to need. Jobs that end, by their wall time or otherwise, are replaced as long as there are tasks to begin.
+A job runs one task at a time, or `processes` of them, and requests the predicted resources of the largest task. Jobs
+that end, by their wall time or otherwise, are replaced while tasks wait.
 """
 
 from __future__ import annotations
@@ -35,41 +35,41 @@ from tetopt.system.budget import memory_words
 from tetopt.system.incoming import text_of
 from tetopt.system.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
-YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
-YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000
-JOBS_AT_ONCE = 20  # where `workers` does not say: a cluster's other users wait for as many cores
-JOB_CORES = 4  # of a job where neither its file nor `threads` says
-QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
-IDLE_SECONDS = 60.0  # without a task to begin, after which jobs that run none are given back
-AGAIN_SECONDS = 60.0  # after a job that was refused when others were not, until the next is submitted
-MOST_LOST = 3  # jobs that ended before their worker was there, one after the other: they are not going to be better
-# Keys that dask-jobqueue still takes under their old names, with a warning.
+YAML_LETTERS = 20_000  # of a configuration: known ones have a thousand
+YAML_BRACKETS = 500  # of a configuration: PyYAML's time grows with the square of nested brackets, 4 s for 4000
+JOBS_AT_ONCE = 20  # without `workers`: other users wait for these cores
+JOB_CORES = 4  # of a job, unless its file or `threads` sets them
+QUEUE_SECONDS = 5.0  # between two checks of jobs: a scheduler starts them no faster
+IDLE_SECONDS = 60.0  # without waiting tasks, after which idle jobs are released
+AGAIN_SECONDS = 60.0  # between a refused job, if others were accepted, and the next submission
+MOST_LOST = 3  # consecutive jobs that ended before their worker came: further ones would, too
+# Keys that dask-jobqueue still accepts under old names, with a warning.
 OLD_KEYS = {"extra", "job-extra", "env-extra"}
-# What must say the memory by the site's own words, as dask-jobqueue does not there.
+# Keys that request memory in a site's own form, where dask-jobqueue does not.
 MEMORY_KEYS = {"sge": "resource-spec", "oar": "memory-per-core-property-name"}
-# In directives of a job neither blanks nor quotes can be relied on.
+# Directives of a job may not support blanks or quotes.
 PLAIN_PATH = re.compile(r"[\w./+@=:,-]+")
 
 
 class Request(NamedTuple):
-    """What a job asks for."""
+    """Resources of a job."""
 
     cores: int
     bytes: float
     processes: int  # tasks at a time
     threads: int  # of each
-    task_bytes: float  # that each may take
-    exports: tuple[str, ...] = ()  # lines of its script: names in the environment of its workers
+    task_bytes: float  # of each task
+    exports: tuple[str, ...] = ()  # lines of its script: its workers' environment variables
 
 
 def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count: int | None) -> Workers:
-    """Workers that are jobs of a batch system, as a file says; they are asked for, and come when there is room.
+    """Request workers that are jobs of a batch system, by a file; they start when the system has room.
 
     Raises
     ------
     InputError
-        As `configuration` and `request`; the system's commands are not there; it does not take the first job; from
-        `slots`: jobs end before their worker is there.
+        As `configuration` and `request`; the system's commands are missing; it refuses the first job; from `slots`:
+        jobs end before their worker starts.
     """
     import dask
     from distributed import Client
@@ -78,27 +78,27 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     kinds = _kinds()
     command = shlex.split(kinds[kind].job_cls.submit_command)[0]
     if shutil.which(command) is None:
-        raise InputError(f"{path}: {kind}: {command} is not there; run this where jobs are submitted")
+        raise InputError(f"{path}: {kind}: command {command} not found; run this where jobs are submitted")
     for folder in folders:
         if not PLAIN_PATH.fullmatch(str(folder)):
             raise InputError(
-                f"{folder}: expected an output folder of letters, digits and ./+@=:,-_ alone with `cluster`, "
-                "as directives of jobs take no others"
+                f"{folder}: expected an output folder with only letters, digits and ./+@=:,-_ for `cluster`, "
+                "as in directives of jobs"
             )
-    # Its own keys on top of the user's configuration of dask, as if they stood there.
+    # Its own keys override the user's configuration of dask.
     stack.enter_context(
         dask.config.set({f"jobqueue.{kind}.{key}": value for key, value in settings.items()} | need.settings())
     )
     job = request(path, kind, dask.config.get(f"jobqueue.{kind}"), need)
     own_folder = folders.work / "dask"
-    own_folder.mkdir(mode=0o700, exist_ok=True)  # with the keys by which workers and scheduler know one another
+    own_folder.mkdir(mode=0o700, exist_ok=True)  # with the keys of workers and scheduler
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
     cluster = stack.enter_context(cluster_of(path, kind, job, own_folder, folders.logs))
     client = stack.enter_context(Client(cluster))
     client.register_plugin(beginning(need.is_within))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)
-    with _refused("`cluster`: the batch system takes no job"):
+    with _refused("`cluster`: the batch system refuses jobs"):
         cluster.sync(_first, cluster)
     n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_tasks // job.processes))
     jobs = cluster.adapt(
@@ -115,7 +115,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
 
 
 def configuration(path: Path) -> tuple[str, dict[str, Any]]:
-    """The batch system that a file of dask-jobqueue's configuration names, and its settings.
+    """Read the batch system and its settings from a file of dask-jobqueue's configuration.
 
     Parameters
     ----------
@@ -127,12 +127,12 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
     kind : str
         As "slurm".
     settings : dict
-        With - for _ in their names.
+        Settings with - for _ in their names.
 
     Raises
     ------
     InputError
-        Not YAML, aliases in it, another system or key than there are, a value of another type.
+        The file is not YAML or has aliases; a system or key is unknown; a value has another type.
     """
     table = _yaml_of(path)
     systems = table.get("jobqueue") if isinstance(table, dict) and set(table) == {"jobqueue"} else None
@@ -159,12 +159,12 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Request:
-    """What a job asks for: what its file says, and for the rest what a task needs.
+    """Return the resources of a job: those in its file, and otherwise what a task needs.
 
     Raises
     ------
     InputError
-        Fewer cores or less memory than a task needs, or no memory where dask-jobqueue cannot tell the system.
+        There are fewer cores or less memory than a task needs, or no memory where dask-jobqueue cannot request it.
     """
     processes = settings["processes"] or 1
     cores = settings["cores"] or (need.threads or JOB_CORES) * processes
@@ -177,25 +177,25 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
     least = need.limit_for(need.task_bytes) * processes
     asked_for = need.limit_for(MEMORY_MARGIN * need.task_bytes) * processes
     n_bytes = asked_for
-    for key in ("memory", "job-mem", "mem"):  # for dask; what SLURM and LSF are asked for instead
+    for key in ("memory", "job-mem", "mem"):  # for dask; SLURM's and LSF's requests
         if settings.get(key) is not None:
             n_bytes = _bytes_of(f"{path}: {kind}: {key}", settings[key])
             if n_bytes < least:
                 raise InputError(
                     f"{path}: {kind}: {key}: expected at least {memory_words(least)} for {processes} of the largest "
-                    f"tasks at a time, got {settings[key]}; leave it out, and jobs ask for what tasks need"
+                    f"tasks at a time, got {settings[key]}; leave it out, and jobs request what tasks need"
                 )
     if (name := MEMORY_KEYS.get(kind)) is not None and settings[name] is None:
         raise InputError(
-            f"{path}: {kind}: expected {name}, by which a job asks for {memory_words(asked_for)} here "
-            "(dask-jobqueue asks for none by itself), got none; your cluster's manual says how"
+            f"{path}: {kind}: expected {name} to request {memory_words(asked_for)} per job, "
+            "which dask-jobqueue does not do by itself, got none; see your cluster's manual"
         )
     return Request(cores, n_bytes, processes, threads, need.room_of(n_bytes / processes), _exports(need, threads))
 
 
 def _exports(need: Need, threads: int) -> tuple[str, ...]:
-    """What workers are told by their environment; more where they run tasks themselves."""
-    names: dict[str, Any] = {SAFE_PATH_NAME: 1}  # a job begins in a folder that may hold untrusted modules
+    """Return the workers' environment variables; more if they run tasks themselves."""
+    names: dict[str, Any] = {SAFE_PATH_NAME: 1}  # a job's current folder may contain untrusted modules
     if need.is_within:
         names |= {f"DASK_{key.upper().replace('.', '__')}": value for key, value in WITHIN_SETTINGS.items()}
         names[THREADS_NAME] = threads
@@ -204,9 +204,9 @@ def _exports(need: Need, threads: int) -> tuple[str, ...]:
 
 @contextmanager
 def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) -> Iterator[Any]:
-    """A cluster of dask-jobqueue's without jobs yet; its scheduler is in this process, with certificates of its own.
+    """Create a dask-jobqueue cluster without jobs; its scheduler is in this process, with its own certificates.
 
-    Their files lie in `folder` until the block ends.
+    Their files are in `folder` until the block ends.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
             memory=int(job.bytes),
             processes=job.processes,
             python=settings["python"] or shlex.join(python_command()),
-            # dask's threads are tasks at a time; the last of two is taken.
+            # dask's threads are simultaneous tasks; the last of two values is used.
             worker_extra_args=[*settings["worker-extra-args"], "--nthreads", "1"],
             log_directory=settings["log-directory"] or str(logs),
             job_name="tetopt" if settings["name"] == "dask-worker" else settings["name"],
@@ -236,69 +236,69 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
     try:
         with cluster:
             yield cluster
-    finally:  # not when it is collected, which may be after its folder has gone
+    finally:  # not when it is collected, possibly after its folder was removed
         for value in list(vars(cluster).values()):
             if isinstance(value, tempfile._TemporaryFileWrapper):
                 value.close()
 
 
 def _watched(job_cls: Any, folder: Path, prologue: list[str]) -> Any:
-    """Jobs of which is known that they were not taken, or ended."""
+    """Return a class of jobs that records refused and ended jobs."""
     from distributed.core import Status
 
     class Watched(job_cls):
         def __init__(self, *arguments: Any, name: Any = None, **names: Any) -> None:
             self.ended = folder / f"{name}.ended"
             self.begun_at = time.monotonic()
-            self.seen_at = float("inf")  # when one of its workers was there last
+            self.seen_at = float("inf")  # time of the last contact with one of its workers
             lines = [f"trap 'touch {self.ended} 2>/dev/null' EXIT", *prologue]
             super().__init__(*arguments, name=name, job_script_prologue=lines, **names)
 
         def is_over(self) -> bool:
-            """Whether it has ended; one that was not taken a while after, when the batch system may take another."""
+            """Return whether it has ended; a refused job ends after a while, when the system may accept another."""
             is_refused = self.status == Status.failed
             return time.monotonic() - self.begun_at > AGAIN_SECONDS if is_refused else self.ended.exists()
 
         async def start(self) -> None:
             self.ended.unlink(missing_ok=True)
-            self.status = Status.failed  # until it is taken
+            self.status = Status.failed  # until it is accepted
             await super().start()
 
         async def close(self) -> None:
             await super().close()
-            self.status = Status.closed  # which dask-jobqueue leaves out, and dask asserts
+            self.status = Status.closed  # dask-jobqueue omits it, and dask asserts it
 
     return Watched
 
 
 def _demand(newcomers: Newcomers, logs: Path) -> Any:
-    """Dask's adaptive scaling, to as many jobs as there are tasks for: its scheduler knows only of those that run.
+    """Return dask's adaptive scaling to the number of waiting tasks, as its scheduler knows only running ones.
 
-    Jobs that have ended make room for others, which dask leaves out where they ended before their workers came, or have
-    several.
+    Ended jobs are replaced, which dask does not do for jobs that ended before their workers came, or with several
+    workers.
     """
     from dask import config
     from dask.utils import parse_timedelta
     from distributed import Adaptive
 
-    # Of a job all of whose workers have gone; a nanny starts those again that crash, in a second.
+    # After the last worker of a job has gone; a nanny restarts crashed workers within a second.
     patience = parse_timedelta(config.get("distributed.deploy.lost-worker-timeout"))
 
     class Demand(Adaptive):
         cluster: Any
         asked_at = float("inf")
-        n_lost = 0  # jobs that ended before their worker was there, since one was
+        n_lost = 0  # jobs that ended before their worker came, since the last that came
 
         def slots(self) -> int:
-            """How many tasks may run now; InputError if there is no hope that it becomes more than none."""
+            """Return the number of tasks that may run now; raise InputError if it will remain 0."""
             self.asked_at = time.monotonic()
             slots = newcomers.slots()
             if slots == 0 and self.n_lost >= MOST_LOST:
-                raise InputError(f"`cluster`: {self.n_lost} jobs ended as they began; their logs in {logs} say why")
+                raise InputError(f"`cluster`: {self.n_lost} jobs ended at their start; see their logs in {logs}")
             return slots
 
         async def target(self) -> int:
-            """So many workers; asked every `QUEUE_SECONDS`."""
+            """Return the number of workers; called every `QUEUE_SECONDS`."""
             now, over = time.monotonic(), []
             for name, job in self.cluster.workers.items():
                 if {f"{name}{suffix}" for suffix in self.cluster.new_spec.get("group", [""])} & self.observed:
@@ -315,18 +315,18 @@ def _demand(newcomers: Newcomers, logs: Path) -> Any:
 
 
 async def _first(cluster: Any) -> None:
-    """Submit one job; of those of `scale` nobody hears that they are refused."""
+    """Submit one job, as `scale` does not report refused jobs."""
     cluster.worker_spec.update(cluster.new_worker_spec())
     await cluster
 
 
 def _job_of(worker: Any) -> str:
-    """The job of a worker, one of several in it."""
+    """Return the job of a worker, which may be one of several in it."""
     return str(worker.name).rpartition("-")[0]
 
 
 def _kinds() -> dict[str, Any]:
-    """The clusters of dask-jobqueue, by the names that its configuration has for them."""
+    """Return the clusters of dask-jobqueue, by their names in its configuration."""
     import dask_jobqueue
 
     clusters = [value for value in vars(dask_jobqueue).values() if getattr(value, "job_cls", None)]
@@ -335,7 +335,7 @@ def _kinds() -> dict[str, Any]:
 
 @cache
 def _defaults() -> dict[str, dict[str, Any]]:
-    """The keys of each system with their defaults, as dask-jobqueue comes with them."""
+    """Return the keys of each system with dask-jobqueue's defaults."""
     import yaml
 
     return yaml.safe_load(files("dask_jobqueue").joinpath("jobqueue.yaml").read_text(encoding="utf-8"))["jobqueue"]
@@ -354,17 +354,17 @@ def _yaml_of(path: Path) -> Any:
     try:
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
             raise InputError(
-                f"{path}: expected YAML without aliases (*name), which may stand for any amount; write it out"
+                f"{path}: expected YAML without aliases (*name), which may expand without limit; write it out"
             )
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise InputError(f"{path}: expected YAML, got {_short(error)}; mend that place") from error
+        raise InputError(f"{path}: expected YAML, got {_short(error)}; correct it there") from error
     except (RecursionError, ValueError) as error:
         raise InputError(f"{path}: expected YAML, got {_short(error)}") from error
 
 
 def _check_value(what: str, key: str, value: Any, default: Any) -> None:
-    """InputError where a value is of another type than its key's."""
+    """Raise InputError if a value has another type than its key's."""
     if key == "walltime" and not isinstance(value, str):
         raise InputError(
             f'{what}: expected it in quotes, as "12:00:00" (without, YAML reads seconds), got {_short(value)}'
@@ -395,7 +395,7 @@ def _bytes_of(what: str, value: Any) -> float:
 
 @contextmanager
 def _refused(what: str) -> Iterator[None]:
-    """InputError of one line for what dask-jobqueue raises, or a command of the batch system that it calls says."""
+    """Raise one-line InputErrors for errors of dask-jobqueue, or of the batch system's commands."""
     try:
         yield
     except (ValueError, TypeError, OSError, RuntimeError) as error:
@@ -404,4 +404,4 @@ def _refused(what: str) -> Iterator[None]:
 
 def _short(text: Any) -> str:
     words = " ".join(str(text).split())
-    return words if len(words) <= 200 else f"{words[:197]}..."  # 200: a line or two of a terminal
+    return words if len(words) <= 200 else f"{words[:197]}..."  # 200: one or two lines of a terminal

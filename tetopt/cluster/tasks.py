@@ -1,7 +1,7 @@
-"""Tasks are given to workers as these have room, and those that a worker took with it again.
+"""Submission of tasks to workers as these have room, and of tasks whose worker died.
 
-No more tasks are under way than run at the same time: what a worker takes with it when it dies is then what ran there,
-and the scheduler holds as little of 20,000 tasks as of 20.
+Only running tasks are submitted: a worker that dies then loses only the tasks that ran there, and the scheduler holds
+as little of 20,000 tasks as of 20.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from tetopt.errors import InputError
 from tetopt.io.text import plain
 from tetopt.system.budget import memory_words, peak_bytes
 
-WAIT_SECONDS = 1.0  # between two looks at the workers, which come and go
-LAST_SECONDS = 60.0  # for tasks that run when the others are given up, most of which have the better part behind them
-TASK_ATTEMPTS = 3  # of a task whose worker ends: the first may be an accident, the second of what came before it
-LOST_WORDS = "the scheduler of the cluster does not answer any more"
-MEMORY_TOPIC = "worker-restart-memory"  # dask's: of the workers that nannies end at their limit
+WAIT_SECONDS = 1.0  # between two checks of the workers, which come and go
+LAST_SECONDS = 60.0  # for tasks still running when the others are dropped, most of which are over half done
+TASK_ATTEMPTS = 3  # of a task whose worker ends: the first end may be accidental, the second due to an earlier task
+LOST_WORDS = "the cluster's scheduler no longer answers"
+MEMORY_TOPIC = "worker-restart-memory"  # dask's topic for workers that nannies end at their limit
 
-FULL_NUMBERS = (errno.ENOSPC, errno.EDQUOT)  # of errors: no space on the disk, or none for this user
+FULL_NUMBERS = (errno.ENOSPC, errno.EDQUOT)  # of errors: no space on the disk, or the user's quota exceeded
 
 
 class SchedulerLost(InputError):
-    """The scheduler does not answer any more."""
+    """The scheduler no longer answers."""
 
 
 class TaskOutcome(NamedTuple):
-    """How a task ended."""
+    """The outcome of a task."""
 
     number: int  # in the sequence of tasks
     result: Any  # None if there is an error
@@ -43,13 +43,13 @@ class TaskOutcome(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A task that is done."""
+    """A finished task."""
 
     name: Any
     result: Any
     seconds: float
     worker: str  # its address
-    peak_bytes: int  # the most memory that its process has had, 0 where the system does not say
+    peak_bytes: int  # maximum memory of its process; 0 if the system does not report it
 
 
 def run_tasks(
@@ -61,28 +61,28 @@ def run_tasks(
     is_over: Callable[[], bool] = lambda: False,
     last_seconds: float = LAST_SECONDS,
 ) -> Iterator[Done]:
-    """Run tasks within workers; each that is done, as they end.
+    """Run tasks within workers; yield finished tasks as they end.
 
     Parameters
     ----------
     workers : Workers
-        Of a need that `is_within`.
+        Workers for a need that `is_within`.
     function : callable
-        What is run of each name; it can be pickled. What it gives back is small: what is large lies in files.
+        Function to run for each name; it can be pickled. Its result is small; large data are in files.
     names : sequence
-        In the order in which they begin, of files for instance; they are pickled, and said in messages.
+        Names, e.g. of files, in the order in which tasks begin; they are pickled, and shown in messages.
     attempts : int
-        The most of a task whose worker ends.
+        Maximum number of attempts of a task whose worker ends.
     is_over : callable
-        Asked about once a second: once it is true no task begins any more.
+        Called about once a second: once it returns true, no further task begins.
     last_seconds : float
-        From then on for those that run; what has not ended by then is left, and said nothing of.
+        Time from then on for running tasks; tasks that do not end by then are dropped silently.
 
     Raises
     ------
     InputError
-        The workers that ran a task ended as often as `attempts` says; the function's own; that a task found no memory
-        or no space on the disk. Other tasks that run are left then.
+        Workers ended during all `attempts` of a task; the function raised it; a task found no memory or no disk space.
+        Other running tasks are then dropped.
     Exception
         Other errors of the function, at once.
     SchedulerLost
@@ -107,11 +107,10 @@ def outcomes(
     last_seconds: float = LAST_SECONDS,
     repeats: type[BaseException] | None = None,
 ) -> Iterator[TaskOutcome]:
-    """How each task ended, as they do; of `tasks` keys, unique to the scheduler, and what `task` is called with.
+    """Yield the outcomes of tasks as they end; `tasks` has keys, unique to the scheduler, and arguments of `task`.
 
-    Those whose worker ended are repeated, and those with an error of the type `repeats`, before others begin.
-    `slots` says how many may run at the same time, and is asked again and again; `is_over` and `last_seconds` are those
-    of `run_tasks`.
+    Tasks whose worker ended, or with an error of the type `repeats`, are repeated before others begin. `slots` returns
+    the number of simultaneous tasks, and is called repeatedly; `is_over` and `last_seconds` are those of `run_tasks`.
 
     Raises
     ------
@@ -134,16 +133,16 @@ def outcomes(
             number, attempt = waiting.popleft()
             key, argument = tasks[number]
             running[client.submit(task, argument, key=f"{key}-{attempt}", pure=False)] = number, attempt
-        if not running:  # jobs of a batch system may come in hours
+        if not running:  # jobs of a batch system may take hours to start
             if waiting:
                 time.sleep(WAIT_SECONDS)
             continue
-        with suppress(TimeoutError, CancelledError):  # dask's word for some of them; each is looked at below
+        with suppress(TimeoutError, CancelledError):  # dask raises it for some of them; each is checked below
             wait(list(running), timeout=WAIT_SECONDS, return_when="FIRST_COMPLETED")
         for future in [each for each in running if each.status != "pending"]:
             number, attempt = running[future]
             if future.status != "finished":
-                _check_scheduler(client)  # a client that loses it cancels what it waits for
+                _check_scheduler(client)  # a client that loses it cancels pending results
             del running[future]
             if future.status == "finished":
                 yield TaskOutcome(number, _answer(future.result), None, attempt)
@@ -156,20 +155,20 @@ def outcomes(
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether a task ended with its worker, and not by itself."""
+    """Return whether a task ended because its worker did."""
     from distributed import CancelledError, KilledWorker
 
     return isinstance(error, CancelledError | KilledWorker)
 
 
 def lost_words(attempts: int) -> str:
-    """Why a task that `is_lost` as often has no result."""
+    """Return the reason why a task with this many lost attempts has no result."""
     times = f", {attempts} times" if attempts > 1 else ""
-    return f"the worker that ran it ended{times}, as systems do to those that take too much memory"
+    return f"its worker ended{times}, as systems do to processes that use too much memory"
 
 
 def _measured(function: Callable[[Any], Any], threads: int, name: Any) -> Done:
-    """What a worker runs."""
+    """Run a task in a worker."""
     from distributed import get_worker
 
     limit_threads(threads)
@@ -179,29 +178,31 @@ def _measured(function: Callable[[Any], Any], threads: int, name: Any) -> Done:
 
 
 def limit_threads(number: int) -> None:
-    """Numba's threads from now on, in this thread of Python: so many, or fewer if the process has no more."""
+    """Set numba's number of threads in this Python thread, at most the process's own."""
     import numba
 
-    # What the environment says by now: the main program may have loaded numba before dask set it.
+    # The environment's current value: the main program may have loaded numba before dask set it.
     numba.config.reload_config()
     numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))
 
 
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:
-    """The error of a task, in one line where the user can do something about it."""
+    """Raise the error of a task, in one line if the user can fix it."""
     what = plain(str(name))
-    limit = memory_words(workers.limit) if workers.limit < float("inf") else "there is"
-    advice = "give workers more, or make the tasks smaller"
+    limit = memory_words(workers.limit) if workers.limit < float("inf") else "all there is"
+    advice = "give workers more memory, or make the tasks smaller"
     if is_lost(error):
         ended_at_limit = {event["worker"] for _, event in _answer(partial(workers.client.get_events, MEMORY_TOPIC))}
         last = getattr(getattr(error, "last_worker", None), "address", None)
         if last in ended_at_limit:
-            raise InputError(f"{what}: takes more memory than a worker may, {limit} with its own; {advice}") from error
+            raise InputError(
+                f"{what}: needs more memory than a worker may use, {limit} including its own; {advice}"
+            ) from error
         raise InputError(f"{what}: {lost_words(attempts)}; {advice}") from error
     if isinstance(error, MemoryError):
         reason = plain(" ".join(str(error).split())) or "an allocation failed"
         raise InputError(
-            f"{what}: takes more memory than a worker may, {limit} with its own ({reason}); {advice}"
+            f"{what}: needs more memory than a worker may use, {limit} including its own ({reason}); {advice}"
         ) from error
     if isinstance(error, OSError) and error.errno in FULL_NUMBERS:
         raise InputError(f"{what}: {plain(str(error))}; free some space, and run this again") from error
@@ -214,7 +215,7 @@ def _check_scheduler(client: Any) -> None:
 
 
 def _answer(question: Callable[[], Any]) -> Any:
-    """What the scheduler says, which may be lost just then, before its client knows."""
+    """Return the scheduler's answer; it may have been lost before its client knows."""
     try:
         return question()
     except OSError as error:

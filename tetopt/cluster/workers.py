@@ -1,9 +1,9 @@
-"""Dask's workers: processes of this machine, those of a cluster that runs, or jobs of a batch system.
+"""Dask workers: processes on this machine, those of a running cluster, or jobs of a batch system.
 
-A task is given names of files. What keeps tasks within memory is how many of them there are at a time: that is decided
-here, from what the largest is predicted to need. Where a task watches a process of its own, as a cohort's does, its
-worker is small whatever the task, and a limit of its memory would say nothing about that of the process. A worker that
-runs tasks itself has a limit, which its nanny and the system enforce.
+Tasks receive names of files. The number of simultaneous tasks keeps them within memory, and is chosen here from the
+prediction for the largest one. If a task watches a separate process, as in a cohort, its worker is always small, and a
+memory limit of the worker would not apply to the process. A worker that runs tasks itself has a limit, which its nanny
+and the system enforce.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from tetopt.system.budget import available_bytes, memory_words
 from tetopt.system.extras import install_hint
 from tetopt.system.interpreter import THREADS_NAME, safe_path
 
-CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
-CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
-# A nanny starts its worker again, on a busy machine for longer than the 15 s after which dask would close both.
+CONNECT_SECONDS = 10  # timeout of a scheduler that does not answer: dask's default is 30
+CLOSE_SECONDS = 1.0  # for a worker to end by itself, and again until a killed one is gone: dask's default is 5
+# A nanny restarts its worker, on a busy machine for longer than the 15 s after which dask would close both.
 LOST_SETTINGS = {"distributed.deploy.lost-worker-timeout": "24h"}
-LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # of what speaks in dask
+LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # loggers of dask and its libraries
 DASK_PACKAGES = ("distributed", "dask-jobqueue", "bokeh", "cryptography")  # of the extras "cohort" and "blocks"
 
 
@@ -48,20 +48,20 @@ DASK_PACKAGES = ("distributed", "dask-jobqueue", "bokeh", "cryptography")  # of 
 def workers(
     need: Need, folders: Folders, *, count: int | None, scheduler: str | None, cluster: Path | None
 ) -> Iterator[Workers]:
-    """Workers for as long as the block lasts; none is left after it, however it ends, nor what they wrote into `work`.
+    """Provide workers for the block; after it, however it ends, no worker and none of their files in `work` remain.
 
-    A worker that dies fails its task with `distributed.KilledWorker` at once (with `scheduler`, as often as its own
-    configuration says), so that who submits decides whether it is run again.
+    A worker that dies fails its task with `distributed.KilledWorker` at once (with `scheduler`, by its own
+    configuration), so that the caller decides whether to run it again.
 
     Parameters
     ----------
     need : Need
     folders : Folders
-        Both are there.
+        Existing folders.
     count : int, optional
-        The most tasks at a time on this machine, or jobs of a batch system; not with `scheduler`.
+        Maximum number of simultaneous tasks on this machine, or of jobs of a batch system; not with `scheduler`.
     scheduler : str, optional
-        The address of a scheduler that runs, as "tcp://host:8786"; certificates are those of dask's configuration.
+        Address of a running scheduler, as "tcp://host:8786"; certificates are from dask's configuration.
     cluster : Path, optional
         A file of dask-jobqueue's configuration, see `tetopt.cluster.jobs`.
 
@@ -72,8 +72,8 @@ def workers(
     Raises
     ------
     InputError
-        dask is not installed; a scheduler that does not answer; workers of another version, that do not see `work` or
-        have too little memory (also while the block lasts, from `slots`); a file that is none, or asks for too little.
+        dask is not installed; a scheduler does not answer; workers have another version, cannot access `work` or have
+        too little memory (also during the block, from `slots`); a file is invalid, or requests too little.
     """
     check_choice(count, scheduler, cluster, "blocks" if need.is_within else "cohort")
     with ExitStack() as stack:
@@ -87,16 +87,16 @@ def workers(
 
 
 def check_choice(count: int | None, scheduler: str | None, cluster: Path | None, extra: str) -> None:
-    """InputError for what `workers` refuses at once: to be called before images are read and anything is written.
+    """Raise InputError for what `workers` refuses at once; call it before images are read and anything is written.
 
-    A scheduler is asked, for `CONNECT_SECONDS` at most. `extra` is that of tetopt's which installs what the caller
-    needs: "cohort" or "blocks".
+    A scheduler is contacted, for `CONNECT_SECONDS` at most. `extra` is tetopt's extra that installs the caller's
+    dependencies: "cohort" or "blocks".
     """
     check_installed(extra)
     if scheduler is not None and cluster is not None:
-        raise InputError("`scheduler`, `cluster`: expected one of them, got both")
+        raise InputError("`scheduler`, `cluster`: expected only one of them, got both")
     if scheduler is not None and count is not None:
-        raise InputError("`workers`: expected none with `scheduler`, whose workers are there; start more of them")
+        raise InputError("`workers`: expected none with `scheduler`, which has its own workers; start more of those")
     if cluster is not None:
         configuration(cluster)
     if scheduler is not None:
@@ -105,11 +105,11 @@ def check_choice(count: int | None, scheduler: str | None, cluster: Path | None,
 
 
 def check_installed(extra: str) -> None:
-    """InputError where dask.distributed and what belongs to it is not installed, which an extra of tetopt's is for."""
+    """Raise InputError if dask.distributed and its companions, from an extra of tetopt's, are not installed."""
     before = signal.getsignal(signal.SIGINT)
     try:
         import cryptography  # noqa: F401
-        import dask_jobqueue  # noqa: F401, which ends the program by sys.exit at Ctrl-C as soon as it is imported
+        import dask_jobqueue  # noqa: F401, which makes Ctrl-C end the program by sys.exit once imported
         import distributed  # noqa: F401
     except ImportError as error:
         hint = install_hint(extra, *DASK_PACKAGES)
@@ -120,16 +120,16 @@ def check_installed(extra: str) -> None:
 
 
 class Share(NamedTuple):
-    """How this machine is divided."""
+    """The division of this machine."""
 
     workers: int  # each with one task at a time
     threads: int  # of each task
     bytes: float  # for each task
-    limit: float  # of a worker in all
+    limit: float  # total of a worker
 
 
 def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
-    """As many workers as cores, memory (bytes that are free), `count` and tasks allow, at least one."""
+    """Return as many workers as cores, free memory in bytes, `count` and tasks allow, at least one."""
     per_task = need.limit_for(MEMORY_MARGIN * need.task_bytes)
     most = [need.n_tasks, cores // (need.threads or 1)]
     if free < float("inf"):
@@ -142,14 +142,14 @@ def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
 
 
 def local_share(need: Need, count: int | None) -> Share:
-    """How this machine, as affinity and containers leave it, is divided."""
+    """Divide this machine, within its affinity and container limits."""
     from dask.system import CPU_COUNT
 
     return shares(need, count, CPU_COUNT, float(available_bytes()))
 
 
 def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) -> Workers:
-    """A cluster within this machine, on its loopback, with certificates of its own: others here cannot submit code."""
+    """Start a cluster on this machine's loopback, with its own certificates, so that other users cannot submit code."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -158,12 +158,12 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     stack.enter_context(dask.config.set(need.settings() | LOST_SETTINGS))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
-    # Where a task is a process of its own the worker is small, and its limit would not be that process's.
+    # If a task is a separate process, the worker is small, and its limit would not apply to the process.
     limit = int(share.limit) if need.is_within and share.limit < float("inf") else 0
     cluster = stack.enter_context(
         LocalCluster(
             n_workers=share.workers,
-            threads_per_worker=1,  # tasks at a time
+            threads_per_worker=1,  # simultaneous tasks
             security=True,
             memory_limit=limit,
             local_directory=str(own_folder),
@@ -183,25 +183,25 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
 
 
 async def _closed(cluster: Any) -> None:
-    """Soon, whatever runs there: of tasks that workers run themselves, those left lose nothing but time."""
+    """Close soon, whatever runs there: unfinished tasks within workers only lose time."""
     await asyncio.gather(*(nanny.close(timeout=CLOSE_SECONDS) for nanny in cluster.workers.values()))
 
 
-# ---- A cluster that runs
+# ---- A running cluster
 
 
 def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> Workers:
-    """The workers of a scheduler that others started."""
+    """Return the workers of an existing scheduler."""
     from distributed import Client
 
     with _answering(address), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of versions that differ: what matters of them is checked, in one line
+        warnings.simplefilter("ignore")  # on different versions: relevant ones are checked, in one line
         client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)
     slots = newcomers.slots()
     if slots == 0:
-        raise InputError(f"`scheduler`: {address} has no workers; start some: dask worker {address}")
+        raise InputError(f"`scheduler`: {address} has no workers; start some with: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
     n_bytes = min(map(newcomers.room_of, newcomers.known.values()), default=float("inf"))
     words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
@@ -212,34 +212,34 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
 
 @contextmanager
 def _answering(address: str) -> Iterator[None]:
-    """InputError where a connection to a scheduler fails in the block."""
+    """Raise InputError if a connection to a scheduler fails in the block."""
     try:
         yield
-    except MemoryError as error:  # the first bytes of another service's answer, read as the length of a message
+    except MemoryError as error:  # another service's first bytes, read as the length of a message
         raise InputError(
-            f"`scheduler`: {address} is not a dask scheduler, another service answers there; expected the address of "
-            "a dask scheduler that runs, as tcp://host:8786"
+            f"`scheduler`: {address} is another service, not a dask scheduler; expected the address of a running "
+            "dask scheduler, such as tcp://host:8786"
         ) from error
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        reason = " ".join(str(error).split()) or f"nothing within {CONNECT_SECONDS:g} s"
+        reason = " ".join(str(error).split()) or f"no reply within {CONNECT_SECONDS:g} s"
         raise InputError(
-            f"`scheduler`: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
-            "runs, as tcp://host:8786"
+            f"`scheduler`: {address} does not answer ({reason[:200]}); expected the address of a running dask "
+            "scheduler, such as tcp://host:8786"
         ) from error
 
 
 async def _reached(address: str) -> None:
-    """A connection, closed again. A client that cannot make one may be left half begun, and hangs when collected."""
+    """Open and close a connection, as a client that cannot connect may remain half started and hang when collected."""
     from distributed.comm import connect
     from distributed.security import Security
 
-    async with asyncio.timeout(CONNECT_SECONDS):  # dask's own ends before the first words of the other side
+    async with asyncio.timeout(CONNECT_SECONDS):  # dask's own timeout ends before the first reply
         comm = await connect(address, timeout=CONNECT_SECONDS, **Security().get_connection_args("client"))
         await comm.close()
 
 
 def _threads_each(abouts: list[About]) -> int:
-    """Of each host its cores by the tasks that run there at a time; the fewest of all hosts."""
+    """Return cores per simultaneous task of a host, the minimum over all hosts."""
     hosts: dict[str, list[About]] = {}
     for about in abouts:
         hosts.setdefault(about.host, []).append(about)
@@ -247,13 +247,13 @@ def _threads_each(abouts: list[About]) -> int:
     return max(1, min(shares_of_hosts, default=1))
 
 
-# ---- What dask says
+# ---- Output of dask
 
 
 @contextmanager
 def _quiet(log: Path) -> Iterator[None]:
-    """What dask's loggers say goes into a file, which is made when there is something, and not to the terminal."""
-    import distributed  # noqa: F401  (it puts the handlers there that are taken away here)
+    """Redirect dask's loggers from the terminal to a file, which is created on the first message."""
+    import distributed  # noqa: F401  (it adds the handlers that are removed here)
 
     handler = logging.FileHandler(log, delay=True, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
@@ -265,7 +265,7 @@ def _quiet(log: Path) -> Iterator[None]:
             logger.handlers, logger.propagate = [handler], False
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Port .* is already in use")  # of the dashboard, where another run's is
+            warnings.filterwarnings("ignore", "Port .* is already in use")  # of the dashboard, if another run uses it
             yield
     finally:
         for logger, handlers, propagate in before:

@@ -1,1 +1,1 @@
-"""Cohorts: hundreds of subjects, each meshed by a process of its own, on a cluster; resumed, and judged at a glance."""
+"""Cohorts: hundreds of subjects, each meshed by its own process, on a cluster; resumable, with an overview page."""

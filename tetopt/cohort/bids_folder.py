@@ -1,9 +1,9 @@
 """The raw images of a BIDS folder, as rows of a cohort.
 
-By pybids, the field's own library, and not by bids2table or ancpbids: of these three it alone keeps to the raw images
-(not those of `derivatives` and `sourcedata`), and to folders whose names have dots or brackets. It is the slowest, 4 s
-for 2,000 subjects of 21,000 files and 40 s for 20,000, where they take 1 s, which is nothing beside one mesh, and 0.2 s
-for two by name. Only names of files are looked at: a broken or a hostile JSON beside an image is never opened.
+Uses pybids, the field's own library, rather than bids2table or ancpbids: only pybids excludes `derivatives` and
+`sourcedata`, and accepts folders with dots or brackets in their names. It is the slowest, with 4 s for 2,000 subjects
+of 21,000 files and 40 s for 20,000, where the others take 1 s, which is little beside one mesh, and 0.2 s for two
+subjects by name. Only file names are used: a broken or hostile JSON beside an image is never opened.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from tetopt.io.text import plain
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import json_of, text_of
 
-BIDS_ENDINGS = (".nii.gz", ".nii")  # that of two with one name which is read comes first
+BIDS_ENDINGS = (".nii.gz", ".nii")  # the first is read if both exist
 RAW_PLACE = "sub-[^/]+/(ses-[^/]+/)?(?!ses-)[^/]+/[^/]+"
-NAMED_SUBJECTS = 5  # so many are named where some have no image: whoever wants all counts the rows
+NAMED_SUBJECTS = 5  # subjects without an image that a message names
 
 
 class Name(NamedTuple):
-    """A file's name as BIDS reads it, `acq-mprage_run-1_T1w` say."""
+    """A file's name as BIDS parses it, e.g. `acq-mprage_run-1_T1w`."""
 
     entities: dict[str, str]
     suffix: str
 
     def is_of(self, kind: Name) -> bool:
-        """Whether it has that suffix, and those entities among others; numbers with or without zeros ahead."""
+        """Return whether it has that suffix and includes those entities; leading zeros of numbers are ignored."""
         same = (_same(self.entities.get(key), value) for key, value in kind.entities.items())
         return self.suffix == kind.suffix and all(same)
 
 
 class Scan(NamedTuple):
-    """An image of a subject in one session, "" if there are none."""
+    """An image of a subject in one session, "" without sessions."""
 
     subject: str
     session: str
@@ -49,19 +49,19 @@ class Scan(NamedTuple):
 def bids_subjects(
     folder: str | Path, suffix: str = "T1w", participants: Sequence[str] = (), sessions: Sequence[str] = ()
 ) -> list[Subject]:
-    """The raw images of a BIDS folder, one of each subject and session.
+    """Find the raw images of a BIDS folder, one for each subject and session.
 
-    Of names that end in .nii and .nii.gz the latter is taken, of several images that which has no other entities than
-    those of `suffix`. Subjects without any are left out, with a warning.
+    Between .nii and .nii.gz the latter is used, and among several images the one without entities beyond those of
+    `suffix`. Subjects without an image are left out with a warning.
 
     Parameters
     ----------
     folder : str or Path
-        With a `dataset_description.json`; what is in `derivatives` and `sourcedata` is not looked at.
+        Folder with a `dataset_description.json`; its `derivatives` and `sourcedata` are ignored.
     suffix : str, default "T1w"
-        What comes last in the images' names; entities before it choose among several, as in `acq-mprage_T1w`.
+        End of the images' names; entities before it select among several, as in `acq-mprage_T1w`.
     participants, sessions : sequence of str
-        Only these, with or without `sub-` and `ses-`; all where there are none.
+        Only these, with or without `sub-` and `ses-`; all if empty.
 
     Returns
     -------
@@ -71,10 +71,10 @@ def bids_subjects(
     Raises
     ------
     InputError
-        No BIDS folder; pybids is not installed; no image.
+        The folder is not a BIDS folder; pybids is not installed; there is no image.
     Problems
-        All of these: participants or sessions that are not there, several images for one row, files in another
-        subject's folder. Whether the images can be read is not asked.
+        All missing participants or sessions, several images for one row, files in another subject's folder. The
+        images are not read.
 
     References
     ----------
@@ -96,7 +96,7 @@ def bids_subjects(
     if problems:
         raise Problems([f"{_shown(folder)}: {plain(problem)}" for problem in problems])
     if not chosen:
-        raise InputError(f"{_shown(folder)}: no image _{suffix}.nii.gz of any subject; `suffix` names another kind")
+        raise InputError(f"{_shown(folder)}: no subject has an image _{suffix}.nii.gz; use `suffix` for another kind")
     if not labels:
         what = f"_{suffix} in {', '.join(f'ses-{visit}' for visit in sorted(visits))}" if visits else f"_{suffix}"
         _warn_of_others(folder, what, {scan.subject for scan in chosen})
@@ -104,17 +104,17 @@ def bids_subjects(
 
 
 def _check_dataset(folder: Path) -> None:
-    """InputError for what is no folder, or has no `dataset_description.json` that holds a table."""
+    """Raise InputError unless it is a folder whose `dataset_description.json` contains a table."""
     file = folder / DESCRIPTION_NAME
     if not folder.is_dir():
         raise InputError(f"{_shown(folder)}: no such folder; expected a BIDS dataset")
     if not file.exists():
-        raise InputError(f"{_shown(folder)}: expected a BIDS dataset, with a {DESCRIPTION_NAME}; or give a table")
+        raise InputError(f"{_shown(folder)}: expected a BIDS dataset with a {DESCRIPTION_NAME}, or a table")
     text = text_of(file, "description of a BIDS dataset")
     try:
         table = json_of(text)
     except ValueError as error:
-        raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; mend that place") from error
+        raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; correct it there") from error
     if not isinstance(table, dict):
         raise InputError(f"{_shown(file)}: expected a table in JSON, got {type(table).__name__}")
 
@@ -123,14 +123,14 @@ def _kind(suffix: str) -> Name:
     name = _name(suffix)
     if name is None or not re.fullmatch("[A-Za-z0-9]+", name.suffix) or {"sub", "ses"} & set(name.entities):
         raise InputError(
-            f"`suffix` {plain(suffix)}: expected what a BIDS name ends in, as T1w or acq-mprage_T1w, without .nii.gz; "
-            "`participant_label` and `session_label` choose subjects and sessions"
+            f"`suffix` {plain(suffix)}: expected the end of a BIDS name, as T1w or acq-mprage_T1w, without .nii.gz; "
+            "`participant_label` and `session_label` select subjects and sessions"
         )
     return name
 
 
 def _name(text: str) -> Name | None:
-    """A name without its ending; None if its parts are not those of BIDS."""
+    """Parse a name without its ending; return None if its parts are not BIDS entities."""
     *parts, suffix = text.split("_")
     pairs = [part.partition("-") for part in parts]
     if not all(key and value for key, _, value in pairs):
@@ -145,7 +145,7 @@ def _same(value: str | None, other: str) -> bool:
 
 
 def _scans(folder: Path, suffix: str, labels: Iterable[str]) -> tuple[list[Scan], list[str]]:
-    """All images of a suffix, and what is wrong with the names of some."""
+    """Return all images with a suffix, and the problems of their names."""
     scans, problems = [], []
     for path in _image_paths(folder, suffix, labels):
         place = path.relative_to(folder)
@@ -155,7 +155,7 @@ def _scans(folder: Path, suffix: str, labels: Iterable[str]) -> tuple[list[Scan]
         expected = dict(each.split("-", 1) for each in folders if "-" in each)
         own = {key: value for key, value in (name.entities if name else {}).items() if key in ("sub", "ses")}
         if name is None or own != expected:
-            problems.append(f"{place}: its name is not that of an image in {'/'.join(folders)}; rename or move it")
+            problems.append(f"{place}: the name does not match its folder {'/'.join(folders)}; rename or move it")
             continue
         others = {key: value for key, value in name.entities.items() if key not in own}
         scans.append(Scan(own["sub"], own.get("ses", ""), path, Name(others, name.suffix)))
@@ -163,7 +163,7 @@ def _scans(folder: Path, suffix: str, labels: Iterable[str]) -> tuple[list[Scan]
 
 
 def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]:
-    """The raw files sub-X[/ses-Y]/kind/*_suffix.nii[.gz], by pybids, which is kept from all others."""
+    """Return the raw files sub-X[/ses-Y]/kind/*_suffix.nii[.gz] by pybids, which ignores all others."""
     try:
         from bids import BIDSLayout
         from bids.layout import BIDSLayoutIndexer
@@ -171,10 +171,10 @@ def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]
         raise InputError(f"BIDS folders need pybids: {install_hint('cohort', 'pybids')}, or give a table") from None
     ignored = [
         "^/(?!sub-)",
-        "^(/[^/]*){5}",  # the way of links in a circle has no end
+        "^(/[^/]*){5}",  # circular links have endless paths
         r"\.[^/]*(?<!\.nii)(?<!\.nii\.gz)$",
         rf"_(?!{suffix}\.)[^/_]*\.nii(\.gz)?$",
-        "[\ud800-\udfff]",  # bytes that are no UTF-8 are no name of BIDS, and its index cannot hold them
+        "[\ud800-\udfff]",  # names with invalid UTF-8 are not BIDS names, and the index cannot store them
     ]
     if some := "|".join(map(re.escape, labels)):
         ignored.append(f"^/sub-(?!({some})(/|$))")
@@ -182,19 +182,19 @@ def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]
         validate=False,
         index_metadata=False,
         ignore=[re.compile(each) for each in ignored],
-        config_filename=".no-layout_config.json",  # a folder's own would be code of a kind: patterns
+        config_filename=".no-layout_config.json",  # a folder's own would be untrusted patterns
     )
     try:
         layout = BIDSLayout(str(folder), validate=False, indexer=indexer)
     except (OSError, UnicodeError) as error:
-        raise InputError(f"{_shown(folder)}: cannot be looked through, {plain(str(error))}") from error
+        raise InputError(f"{_shown(folder)}: cannot be searched: {plain(str(error))}") from error
     files = layout.get(suffix=suffix, extension=list(BIDS_ENDINGS), return_type="filename")
     paths = map(Path, files)
     return [path for path in paths if re.fullmatch(RAW_PLACE, path.relative_to(folder).as_posix(), re.DOTALL)]
 
 
 def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) -> Scan:
-    """The one image of a row, or a problem more."""
+    """Select the one image of a row, or add a problem."""
     stems = {scan.path.name.removesuffix(".gz"): scan for scan in scans}  # name.nii.gz comes after name.nii
     exact = [scan for scan in stems.values() if len(scan.name.entities) == len(kind.entities)]
     first, *others = exact or stems.values()
@@ -202,8 +202,8 @@ def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) ->
     if others:
         own = [f"{key}-{value}" for key, value in first.name.entities.items()]
         problems.append(
-            f"{len(places)} images for one row, {', '.join(places)}: choose by entities, "
-            f"as `suffix` {'_'.join([*own, kind.suffix])}, or give a table of images"
+            f"{len(places)} images for one row, {', '.join(places)}: select by entities, "
+            f"such as `suffix` {'_'.join([*own, kind.suffix])}, or give a table of images"
         )
     return first
 
@@ -212,7 +212,7 @@ def _warn_of_others(folder: Path, what: str, subjects: set[str]) -> None:
     others = sorted(path.name for path in folder.glob("sub-*") if path.is_dir() and path.name[4:] not in subjects)
     if others:
         some = ", ".join(others[:NAMED_SUBJECTS]) + (", ..." if len(others) > NAMED_SUBJECTS else "")
-        warn(f"{_shown(folder)}: left out, without {plain(what)}: {len(others)} ({plain(some)})")
+        warn(f"{_shown(folder)}: left out subjects without {plain(what)}: {len(others)} ({plain(some)})")
 
 
 def _subject(scan: Scan, folder: Path) -> Subject:

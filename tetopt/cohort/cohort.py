@@ -1,4 +1,4 @@
-"""A cohort from its table to its page: many runs of the same kind, each as one alone, on the workers of a cluster."""
+"""A cohort from its table to its page: many independent runs on the workers of a cluster."""
 
 from __future__ import annotations
 
@@ -46,23 +46,23 @@ from tetopt.job.options import RunOptions, kinds_of, near_hint
 from tetopt.system.budget import memory_words
 from tetopt.system.files import checked_output
 
-NAMED_FAILURES = 20  # in words: the table and the page have all
-MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
-PAGE_SECONDS = 60.0  # between the table and page of a run under way and the next: nobody looks more often
-PAGE_FRACTION = 0.05  # of the run's time that they may take
+NAMED_FAILURES = 20  # reasons printed: the table and the page have all
+MOST_BESIDE = 200  # subjects of a run beside other runs in the folder, with a lock each: a process may open 1024 files
+PAGE_SECONDS = 60.0  # between updates of the table and page during a run
+PAGE_FRACTION = 0.05  # maximum fraction of the run's time for these updates
 
 
 class CohortPlan(NamedTuple):
-    """What a cohort is to do."""
+    """The plan of a cohort."""
 
     subjects: Path  # the table or folder
     cohort: CohortOptions
     threads: int | None
     suffix: str  # of the meshes' files
     keys: list[str]  # of all subjects
-    entries: list[PlannedSubject]  # likewise; none where the folder is only to be collected
+    entries: list[PlannedSubject]  # of all subjects; empty if the folder is only collected
     to_run: list[PlannedSubject]
-    estimate: Estimate  # of these
+    estimate: Estimate  # of the subjects to run
 
     @property
     def place(self) -> Path:
@@ -71,51 +71,51 @@ class CohortPlan(NamedTuple):
 
 
 class CohortProgress(NamedTuple):
-    """How far the runs of a cohort are."""
+    """Progress of a cohort."""
 
-    ended: Ended  # the last one
+    ended: Ended  # the last run
     n_done: int
-    n_subjects: int  # that are run
+    n_subjects: int  # to run
     n_failed: int
-    seconds_left: float | None  # as far as can be told; None of the last one
+    seconds_left: float | None  # estimated; None for the last run
 
 
 def run_cohort(
     subjects: str | Path, output: str | Path, *, on: Listener | None = None, **options: Any
 ) -> dict[str, str]:
-    """Mesh many subjects, each as `run` would: what `tetopt cohort` does.
+    """Mesh many subjects, each as by `run`, as `tetopt cohort` does.
 
     Parameters
     ----------
     subjects : str or Path
         A table, .tsv or .csv, with the columns subject, image, and any option of a `Job`; or a BIDS folder.
     output : str or Path
-        The folder of all outputs; in that of an earlier run, what is done stays.
+        The folder of all outputs; finished subjects of an earlier run are kept.
     on : callable, optional
-        Gets each `Event`; without one warnings are Python's warnings.
+        Called with each `Event`; without it, warnings are Python's warnings.
     **options
-        Of all subjects, those of a `Job` but images, outputs and parts; and of the cohort: `suffix`, `participants`,
+        For all subjects, those of a `Job` except images, outputs and parts; for the cohort: `suffix`, `participants`,
         `sessions`, `mesh_format`, `write_table`, `dry_run`, `retry_failed`, `collect`, `workers`,
         `scheduler`, `cluster`.
 
     Returns
     -------
     dict
-        By subject, as "sub-01_ses-a", what there is now: "done", "violated" (a mesh that violates a requirement),
-        "failed" or "missing".
+        By subject, as "sub-01_ses-a", its status: "done", "violated" (the mesh violates a requirement), "failed" or
+        "missing".
 
     Raises
     ------
     InputError
-        All that is wrong with table and options, before the first run.
+        All problems of the table and options, before the first run.
 
     See Also
     --------
-    run : One of them.
+    run : Mesh one subject.
 
     Notes
     -----
-    Workers are processes that begin by importing your program: let it call this under ``if __name__ == "__main__":``.
+    Workers are processes that first import your program: call this function under ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -129,7 +129,7 @@ def run_cohort(
     known = kinds_of(CohortOptions) | kinds_of(RunOptions)
     for name in values:
         if name not in known:
-            raise InputError(f"run_cohort: has no option {name!r}" + near_hint(name, known))
+            raise InputError(f"run_cohort: unknown option {name!r}" + near_hint(name, known))
     of_cohort = {name: value for name, value in values.items() if name in kinds_of(CohortOptions)}
     of_runs = {name: value for name, value in values.items() if name not in of_cohort}
     with listened(on):
@@ -141,12 +141,12 @@ def run_cohort(
 
 
 def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> CohortPlan:
-    """What a cohort is to do, told; or, if that is asked for, the table of it written.
+    """Plan a cohort and report the plan; on request, write its table.
 
     Raises
     ------
     InputError
-        Options that cannot be; `Problems` for all that is wrong with the subjects.
+        Options are invalid; `Problems` lists all problems of the subjects.
     """
     check_choice(cohort.workers, cohort.scheduler, cohort.cluster, "cohort")
     suffix = checked_suffix(cohort.mesh_format)
@@ -154,12 +154,12 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     if options.threads is not None and options.threads < 1:
         raise InputError(f"`threads`: expected 1 or more, got {options.threads}")
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
-        raise InputError("`collect` runs nothing; leave it out, or `write_table`, `dry_run` and `retry_failed`")
+        raise InputError("`collect`: runs nothing; leave it out, or `write_table`, `dry_run` and `retry_failed`")
     if cohort.write_table is not None:
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
     if (place / WORK_NAME).is_dir() and cohort.write_table is None and not cohort.dry_run:
-        with locked(place, []):  # said here as well, as the plan of many subjects takes minutes
+        with locked(place, []):  # checked here as well, as planning many subjects takes minutes
             pass
     rows = subjects_of(subjects, cohort)
     plan = CohortPlan(subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], {})
@@ -178,7 +178,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
 
 
 def _tell_plan(plan: CohortPlan) -> None:
-    """How many subjects there are of each kind, and why the ones are run that are there already."""
+    """Report the number of subjects of each kind, and why existing ones are run again."""
     counts = Counter[str](entry.state.status for entry in plan.entries)
     words = {name: STATUS_WORDS.get(name, name) for name in ("done", "violated", "failed", "changed")}
     words["missing"] = "not yet run"
@@ -188,29 +188,29 @@ def _tell_plan(plan: CohortPlan) -> None:
     for (status, why), number in reasons.most_common(NAMED_FAILURES):
         note(f"  {number} {status}: {why}")
     if plan.cohort.retry_failed and counts["changed"]:
-        warning(f"{counts['changed']} subjects stay as they are, of other options or inputs (`retry_failed`)")
+        warning(f"{counts['changed']} subjects are out of date and were skipped (`retry_failed`)")
 
 
 def run_planned(plan: CohortPlan) -> list[Row]:
-    """Run what a plan has to be run, and write the table and the page of what there is then; their rows.
+    """Run a plan's subjects, write the table and the page of the folder, and return their rows.
 
-    They are told as a stage of their own, "collected", also where the run is interrupted.
+    The rows are reported in a stage "collected", even if the run is interrupted.
     """
     place, keys, cohort = plan.place, plan.keys, plan.cohort
-    # Beside runs of others, one folder's.
+    # Other runs may use the same folder.
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
     begin(place, [plan.subjects.absolute().as_uri()])
     with locked(place, alone):
         restore(place, alone)
-        # Once more: another run may have ended since.
+        # Again, as another run may have ended since.
         to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
-            if entry.state.status in ("done", "violated"):  # what failed since was of other options or inputs
+            if entry.state.status in ("done", "violated"):  # later failures had other options or inputs
                 failure_path(place, entry.key).unlink(missing_ok=True)
         try:
             if to_run:
                 _run(plan, to_run)
-        finally:  # also on Ctrl-C: what is done is seen
+        finally:  # also on Ctrl-C, to show what is done
             if plan.entries:
                 restore(place, alone)
             rows = collect(place, keys)
@@ -221,7 +221,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 
 
 def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
-    """Run the subjects; what becomes of each is told."""
+    """Run the subjects, and report each outcome."""
     place, cohort, estimate = plan.place.absolute(), plan.cohort, plan.estimate
     work = place / WORK_NAME
     alive = work / f"run-{secrets.token_hex(4)}"
@@ -237,20 +237,20 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
         ) as pool:
             note(pool.words)
             jobs = [_job(entry, estimate, place, plan.suffix, pool.threads, alive.name) for entry in to_run]
-            jobs.sort(key=lambda job: -job.seconds)  # so that no long one is left alone at the end
+            jobs.sort(key=lambda job: -job.seconds)  # so that no long run remains alone at the end
             refresh, tell = _refresher(place), _teller(jobs, pool.slots())
             try:
                 for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
                     tell(ended)
                     refresh()
-            finally:  # before the workers are closed, which give up what they run as soon as they see it
+            finally:  # before the workers close, which then abandon their runs
                 alive.unlink(missing_ok=True)
     except SchedulerLost as lost:
-        violated(f"{lost}; what was finished is in its place")
+        violated(f"{lost}; finished subjects are kept")
 
 
 def _refresher(place: Path) -> Callable[[], None]:
-    """A function that writes the table and the page of what is there by now, now and then."""
+    """Return a function that updates the table and the page from time to time."""
     last, spent = time.monotonic(), 0.0
 
     def refresh() -> None:
@@ -270,11 +270,11 @@ def _job(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str, th
 
 
 def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], None]:
-    """A function that tells how a subject ended, and how much time the others may take; first that of all is told."""
+    """Return a function that reports a subject's outcome and the remaining time; report the total time first."""
     begun = time.monotonic()
     left = {job.key: max(job.seconds, 1.0) for job in jobs}
     total, n_failed = sum(left.values()), 0
-    started("subjects", f"about {time_words(total / max(n_at_once, 1))} left, as predicted", len(jobs))
+    started("subjects", f"about {time_words(total / max(n_at_once, 1))} left (predicted)", len(jobs))
 
     def tell(ended: Ended) -> None:
         nonlocal n_failed
@@ -282,9 +282,7 @@ def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], No
         left.pop(ended.key, None)
         rest = sum(left.values())
         seconds_left = (time.monotonic() - begun) * rest / max(total - rest, 1.0) if left else None
-        what = {"done": "done", "violated": f"a requirement is violated: {ended.reason}"}.get(
-            ended.status, ended.reason
-        )
+        what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
         memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
         at = CohortProgress(ended, len(jobs) - len(left), len(jobs), n_failed, seconds_left)
         progress(f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})", at)
@@ -293,7 +291,7 @@ def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], No
 
 
 def time_words(seconds: float) -> str:
-    """A time in words."""
+    """Format a time."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"

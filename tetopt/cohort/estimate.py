@@ -1,4 +1,4 @@
-"""What the subjects of a cohort are predicted to take."""
+"""Predicted time and memory of a cohort's subjects."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tetopt.job.predict import size_by_headers
 from tetopt.job.read import read_planned
 from tetopt.system.budget import available_bytes
 
-LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
+LIKE_READS = 8  # subjects of a kind that are read for sizes not in headers: half a minute for large ones
 
 
-Estimate = dict[str, Prediction]  # what subjects are predicted to take, by key, each on one thread
+Estimate = dict[str, Prediction]  # by key, each on one thread
 
 
 def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
-    """What subjects are predicted to take, each on one thread: by their headers, and some of each kind as they are.
+    """Predict time and memory of subjects, each on one thread, from headers and from some subjects of each kind.
 
-    Of the same kind are those of as many files and the same options; of one whose images have several shapes, one of
-    each shape is read, up to `LIKE_READS`, as what labels take differs more between than within.
+    A kind has the same options and number of files; if its images have several shapes, one of each shape is read, up to
+    `LIKE_READS`, as the cost of labels varies more between shapes than within.
     """
     speed = calibrated_speed() if entries else 1.0
     like: dict[tuple[object, ...], dict[tuple[int, ...], RunSize]] = {}
@@ -49,13 +49,13 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
                     known[shape] = size
             nearest = known.get(shape) or next(iter(known.values()), None)
             estimate[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
-        except InputError:  # its run will say it
+        except InputError:  # its run will report it
             continue
     return estimate
 
 
 def _read_size(entry: PlannedSubject) -> RunSize | None:
-    """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
+    """Return the sizes of a run from its files; None if they cannot be read, which its run will report."""
     try:
         with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
             return read_planned(entry.plan).size
@@ -64,7 +64,7 @@ def _read_size(entry: PlannedSubject) -> RunSize | None:
 
 
 def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
-    """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
+    """Return the need of workers; on this machine, without tasks larger than its memory, which will not begin."""
     sizes = [each.peak_bytes for each in estimate.values()]
     if cohort.scheduler is None and cohort.cluster is None:
         free = available_bytes()

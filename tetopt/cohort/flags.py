@@ -1,4 +1,4 @@
-"""What is odd about a subject beside the others: violated requirements, lost labels, another grid, numbers far off."""
+"""Flags of odd subjects: violated requirements, lost labels, another grid, outlying numbers."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ import numpy as np
 from tetopt.cohort.numbers import Row, Value, present
 from tetopt.model.labels import label_words
 
-# A normal number is further from the median than this in 1 case of 1.7 million; those of cohorts have longer tails.
+# A normal number exceeds this distance from the median in 1 case of 1.7 million; cohorts have longer tails.
 FAR_DEVIATIONS = 5.0
-# The MAD of n numbers is itself uncertain: with n of them the limit is (1 + 8 / n) times as far. Flagged by drawing
-# (`tests/cohort/test_flags.py`): normal numbers are flagged in at most 1 case of 1000 at every n from 8 on.
-FEW_SUBJECTS = 8  # with fewer, nothing is said of numbers; also the 8 above
+# The MAD of n numbers is itself uncertain: the limit is (1 + 8 / n) times as far. In simulations
+# (`tests/cohort/test_flags.py`), normal numbers are flagged in at most 1 case of 1000 for every n from 8 on.
+FEW_SUBJECTS = 8  # with fewer, numbers are not judged; also the 8 above
 MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
-MAJORITY_FRACTION = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
-COMMON_FRACTION = 0.9  # of subjects that have what the others lack: in fewer it is a matter of choice
-LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of one size, in one place, differ by as much
-# Of correlations, by which a picture is more like the others' turned over: those of a symmetric head, meshed anew, lie
-# within 0.001 on either side, those of heads with back and front exchanged at 0.01 (whole) to 0.12 (brains).
+MAJORITY_FRACTION = 2 / 3  # of subjects that agree: with fewer there is no common value
+COMMON_FRACTION = 0.9  # of subjects that have what others lack: with fewer it is a choice
+LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of equal size and position differ this much
+# Excess of correlations with the others' flipped pictures: within 0.001 for a symmetric head that is meshed again, and
+# 0.01 (whole heads) to 0.12 (brains) with back and front exchanged.
 TURN_MARGIN = 0.005
-# Turned over, the others' median would be about as far on the other side of 0; what is cut off is at a fifth of that.
+# A flipped picture is about as far on the other side of 0 as the others' median; a cropped one at a fifth of that.
 TURN_FRACTION = 1 / 3
-SIDED_DEVIATIONS = 1.5  # by which the others' median is below 0: normal numbers are there in 9 of 10 at least
-TURN_DEVIATIONS = 2.5  # beyond the median: 6 of 1000 normal numbers, most of which are below the margin
-SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many zeros behind the point
-FLOAT_ROUNDING = 1e-9  # deviations by which a number may be beside the limit that it is at
+SIDED_DEVIATIONS = 1.5  # by which the others' median is below 0: true for at least 9 of 10 normal numbers
+TURN_DEVIATIONS = 2.5  # beyond the median: 6 of 1000 normal numbers, most of them below the margin
+SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many leading zeros
+FLOAT_ROUNDING = 1e-9  # tolerance in deviations for a number at the limit
 
 Side = Literal["both", "above", "below"]
 
 
 class Flag(NamedTuple):
-    """One odd thing about a subject."""
+    """A flag of a subject."""
 
-    column: str  # of `tetopt.cohort.numbers`, or "violated", "label", "duplicate"
+    column: str  # from `tetopt.cohort.numbers`, or "violated", "label", "duplicate"
     words: str  # the reason, on one line
-    score: float  # robust deviations; inf for what is odd without measuring
+    score: float  # robust deviations; inf for oddities that are not numbers
 
 
 class Quantity(NamedTuple):
     """A number in which subjects are compared."""
 
     column: str
-    words: str  # what it is, after which its value can stand
+    words: str  # its name, which may precede its value
     unit: str  # "mm": volume by dimension; "s", "bytes", "" or any other word
     side: Side
     is_log: bool  # ratios count, not differences
-    least: float  # of the scale: a robust deviation is never taken for less, of the logarithm if `is_log`
+    least: float  # of the scale: lower limit of a robust deviation, of the logarithm if `is_log`
 
 
-# The least scales are differences that nobody would look at an image for: 5 % of a volume, 1 degree, 0.002 of rho.
+# The least scales are differences too small to inspect an image: 5 % of a volume, 1 degree, 0.002 of rho.
 QUANTITIES = (
     Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, LEAST_LIKENESS),
     Quantity("energies.E_D_fraction_of_variance", "E_D's fraction of the variance", "", "both", True, 0.05),
@@ -77,7 +77,7 @@ TURN_WORDS = {
 
 
 def label_quantities(number: int, names: dict[int, str]) -> tuple[Quantity, Quantity]:
-    """Volume and Dice of a label."""
+    """Return volume and Dice of a label as quantities."""
     words = label_words(number, names)
     return (
         Quantity(f"labels.{number}.volume", f"volume of label {words}", "mm", "both", True, 0.05),
@@ -86,7 +86,7 @@ def label_quantities(number: int, names: dict[int, str]) -> tuple[Quantity, Quan
 
 
 def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
-    """What is odd about each of the rows, the oddest first; nothing of those without a mesh.
+    """Return the flags of each row, the oddest first; none without a mesh.
 
     Parameters
     ----------
@@ -95,11 +95,10 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     Returns
     -------
     list of list of Flag
-        Of each row: requirements that its mesh violates; labels that no cell carries, and labels that 9 of 10 others
-        have and its image has not, or the other way round; an image that another subject has, too; another orientation,
-        spacing or shape than two thirds have; of 8 or more subjects, a picture that is clearly more like the others'
-        turned over, and numbers more than `limit` robust deviations from the median. 2-D and 3-D meshes are compared
-        each with their like.
+        For each row: violated requirements; labels without a cell, and labels that 9 of 10 others have and its image
+        lacks, or vice versa; an image shared with another subject; another orientation, spacing or shape than two
+        thirds have; with 8 or more subjects, a picture clearly more like the others' flipped pictures, and numbers more
+        than `limit` robust deviations from the median. 2-D and 3-D meshes are compared separately.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
     for ndim, places in _groups(rows).items():
@@ -115,7 +114,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
 
 
 def unjudged(rows: Sequence[Row]) -> list[str]:
-    """What rows are not compared in, a sentence each: they are too few, or so mixed that none of them is the odd one.
+    """Return, a sentence each, comparisons that are not made: too few rows, or values too mixed to have outliers.
 
     Parameters
     ----------
@@ -124,24 +123,24 @@ def unjudged(rows: Sequence[Row]) -> list[str]:
     Returns
     -------
     list of str
-        Of all 2-D and all 3-D meshes, as of `flags_of`.
+        For all 2-D and all 3-D meshes, as in `flags_of`.
     """
     sentences = []
     for ndim, places in _groups(rows).items():
         own, kind = [rows[place] for place in places], f"{'2-D' if ndim == 2 else '3-D'} meshes"
         if len(own) < FEW_SUBJECTS:
-            sentences.append(f"{len(own)} {kind} are too few to compare their numbers; {FEW_SUBJECTS} are enough.")
+            sentences.append(f"{len(own)} {kind} are too few to compare their numbers ({FEW_SUBJECTS} needed).")
         mixed = [words for column, words in GRID_COLUMNS.items() if _is_mixed(_known(own, column))]
         if mixed:
             sentences.append(
-                f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value is shared by "
+                f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value is common to "
                 "two thirds of them."
             )
     return sentences
 
 
 def _groups(rows: Sequence[Row]) -> dict[Value, list[int]]:
-    """Places of the rows that have a mesh, by its dimension."""
+    """Return the places of rows with a mesh, by dimension."""
     groups: dict[Value, list[int]] = defaultdict(list)
     for place, row in enumerate(rows):
         if row.status in ("done", "violated"):
@@ -154,7 +153,7 @@ def _known(rows: Sequence[Row], column: str) -> list[Value]:
 
 
 def _is_mixed(texts: Sequence[Value]) -> bool:
-    """Whether there are several, and no one is that of a majority; two against each other are mixed."""
+    """Return whether there are several values without a majority; two different values are mixed."""
     if len(set(texts)) < 2:
         return False
     count = Counter(texts).most_common(1)[0][1]
@@ -175,11 +174,11 @@ def _lost(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     for place, row in enumerate(rows):
         for number, n_voxels in row.n_lost.items():
             words = f"lost label {label_words(number, names)}"
-            yield place, Flag("label", f"{words}: no cell has it, {n_voxels} voxels do", np.inf)
+            yield place, Flag("label", f"{words}: it has {n_voxels} voxels but no cell", np.inf)
 
 
 def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Labels that nearly all others have, or nearly none."""
+    """Yield flags of labels that nearly all others have, or nearly none."""
     labelled = [place for place, row in enumerate(rows) if row.volumes]
     counts = Counter(number for place in labelled for number in rows[place].volumes)
     for number, count in counts.items():
@@ -196,7 +195,7 @@ def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 
 def _doubled(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Images that several subjects have."""
+    """Yield flags of images that several subjects share."""
     same: dict[Value, list[int]] = defaultdict(list)
     for place, row in enumerate(rows):
         if row.numbers.get("image_sha256") is not None:
@@ -209,13 +208,13 @@ def _doubled(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 
 def _whole_image(row: Row) -> str:
-    """The image that is meshed: the file's checksum, and which part of it."""
+    """Identify the meshed image by the file's checksum and selected part."""
     part = [row.numbers.get(f"options.{name}") for name in ("volume", "crop", "slice")]
     return f"{row.numbers['image_sha256']} {part}"
 
 
 def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Orientations and the like that a majority does not have."""
+    """Yield flags of orientations and the like that differ from a majority."""
     for column, words in GRID_COLUMNS.items():
         texts, known = [row.numbers.get(column) for row in rows], _known(rows, column)
         if len(set(known)) < 2 or _is_mixed(known):
@@ -227,34 +226,34 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 
 def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Pictures that are more like the others' turned over, where the others are clearly less so."""
+    """Yield flags of pictures more like the others' flipped pictures, if the others clearly are not."""
     for column, words in TURN_WORDS.items():
         places = [place for place, row in enumerate(rows) if present([row.numbers.get(column)])]
         values = np.array(present(row.numbers.get(column) for row in rows))
         n_usual = int((values < 0.0).sum())
         if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_FRACTION * len(values) - FLOAT_ROUNDING:
-            continue  # few, or no telling which of them are turned over
+            continue  # too few, or unclear which of them are flipped
         middle = float(np.median(values))
         spread = MAD_OF_NORMAL * float(np.median(np.abs(values - middle)))
         if middle + SIDED_DEVIATIONS * spread > -TURN_MARGIN:
-            continue  # of a shape that tells no sides apart
+            continue  # a symmetric shape
         least = max(TURN_MARGIN, -TURN_FRACTION * middle, middle + TURN_DEVIATIONS * spread)
         likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
         for k in np.flatnonzero(values >= least).tolist():
             if _is_like(rows[places[k]], values[k], likeness):
-                reason = f"its picture is more like the others' with {words}; {n_usual} of {len(values)} are less so"
+                reason = f"its picture is more like the others' with {words}; not so for {n_usual} of {len(values)}"
                 yield places[k], Flag(column, reason, np.inf)
 
 
 def _is_like(row: Row, margin: float, likeness: list[float]) -> bool:
-    """Whether a picture that is turned over is as like the others' as those are: one that is cut off is not."""
+    """Return whether a flipped picture is as like the others' as they are; a cropped picture is not."""
     turned = present([row.numbers.get("thumbnail.likeness")])[0] + margin
     score = deviations(np.array([*likeness, turned]), False, LEAST_LIKENESS)[-1]
     return bool(score > -limit(len(likeness)))
 
 
 def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:
-    """Numbers far from the median."""
+    """Yield flags of numbers far from the median."""
     for quantity in QUANTITIES:
         yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
     numbers = sorted({number for row in rows for number in row.volumes if number > 0})
@@ -281,16 +280,16 @@ def _far_in(quantity: Quantity, values: Sequence[Value], ndim: int) -> Flagged:
 
 
 def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
-    """How far numbers are from their median, in robust standard deviations.
+    """Return the distances of numbers from their median, in robust standard deviations.
 
     Parameters
     ----------
     values : (K,) float
         At least one.
     is_log : bool
-        Of their logarithms; a number that has none is at -inf.
+        Use logarithms; a number without one is at -inf.
     least : float
-        What a deviation counts at least, above 0: where most of the numbers are the same, the MAD is 0.
+        Lower limit of a deviation, above 0, as the MAD is 0 if most numbers are equal.
 
     Returns
     -------
@@ -303,14 +302,14 @@ def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
     >>> deviations(np.array([1.0, 1.0, 1.0, 2.0]), False, 0.1).tolist()
     [0.0, 0.0, 0.0, 10.0]
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # most at -inf: nan, which is not far
+    with np.errstate(divide="ignore", invalid="ignore"):  # if most are at -inf: nan, which is not far
         x = np.log(np.maximum(values, 0.0)) if is_log else values
         distance = x - np.median(x[np.isfinite(x)])
         return distance / max(MAD_OF_NORMAL * float(np.median(np.abs(distance))), least)
 
 
 def limit(n: int) -> float:
-    """From how many robust deviations on one of n numbers is far.
+    """Return the robust deviations from which one of n numbers is far.
 
     Examples
     --------
@@ -321,10 +320,10 @@ def limit(n: int) -> float:
 
 
 def units(unit: str, ndim: int) -> Callable[..., str]:
-    """How a number of that unit is written: volumes in mm^n as ml or l, bytes as MB or GB, seconds as min or h.
+    """Return a formatter for numbers of a unit: volumes in mm^n as ml or l, bytes as MB or GB, seconds as min or h.
 
-    What is returned takes the number, and as a second one, if there is one, what it stands beside: of two numbers of
-    which neither is `SHORT_RATIO` times the other both are written in the larger one's unit.
+    It takes the number and, optionally, a number shown beside it: if neither is `SHORT_RATIO` times the other, both are
+    written in the larger one's unit.
 
     Examples
     --------

@@ -1,11 +1,11 @@
-"""Where a cohort's files lie, by the names of BIDS derivatives, and who may write there.
+"""Layout of a cohort's files, with names of BIDS derivatives, and locks for writing.
 
-OUT/dataset_description.json                   by which the folder is known to be a cohort's
+OUT/dataset_description.json                   identifies the folder as a cohort's
 OUT/cohort.tsv, cohort.html                    all subjects
-OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     and the numbers of the run beside it, in a file of the same name in JSON
+OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the run's numbers beside it, in a JSON file of the same name
 OUT/sub-X[/ses-Y]/figures/                     its pictures
-OUT/logs/KEY.log, KEY.failed.json              what the last run said, and why it failed
-OUT/.work/                                     what is under way (`tetopt.system.work_directory`)
+OUT/logs/KEY.log, KEY.failed.json              output of the last run, and why it failed
+OUT/.work/                                     unfinished outputs (`tetopt.system.work_directory`)
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from tetopt.system.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
 TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
-OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write into OUT
-BIDS_VERSION = "1.10.0"  # of the specification whose names are followed
+OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write to OUT
+BIDS_VERSION = "1.10.0"  # of the specification that names follow
 KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
-# Of a subject before its new outputs take their place, with what users put there; its outputs under way; what dask
-# leaves. Nothing in these is opened, it is moved or removed.
+# A subject's former outputs, with users' own files, before new ones replace them; its unfinished outputs; dask's files.
+# None of these is opened, only moved or removed.
 WORK = Layout(
     "cohort",
     rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock|run-\w+|seen-\d+",
@@ -43,46 +43,46 @@ WORK = Layout(
 
 
 def subject_folder(out: Path, key: str) -> Path:
-    """Where the outputs of a subject lie."""
+    """Return the folder of a subject's outputs."""
     subject, _, session = key.partition("_")
     return out / subject / session if session else out / subject
 
 
 def mesh_name(key: str, suffix: str) -> str:
-    """What the file of a subject's mesh is called; its numbers are in that of the suffix ".json"."""
+    """Return the file name of a subject's mesh; with the suffix ".json", that of its numbers."""
     return f"{key}_desc-tetopt_mesh{suffix}"
 
 
 def numbers_path(out: Path, key: str) -> Path:
-    """The numbers of a subject's run, as `tetopt mesh --json` writes them."""
+    """Return the path of the numbers of a subject's run, as from `tetopt mesh --json`."""
     return subject_folder(out, key) / mesh_name(key, ".json")
 
 
 def log_path(out: Path, key: str) -> Path:
-    """What the last run of a subject said."""
+    """Return the path of the output of a subject's last run."""
     return out / LOGS_NAME / f"{key}.log"
 
 
 def failure_path(out: Path, key: str) -> Path:
-    """Why the last run of a subject failed; not there if it did not."""
+    """Return the path of the failure of a subject's last run, which exists only if it failed."""
     return out / LOGS_NAME / f"{key}.failed.json"
 
 
 def thumbnail_path(out: Path, key: str) -> Path:
-    """The picture of a subject that the page has."""
+    """Return the path of a subject's picture for the page."""
     return subject_folder(out, key) / FIGURES_NAME / "thumbnail.png"
 
 
 def check_out(out: Path) -> None:
-    """InputError for a folder that holds anything but a cohort of ours, or links where runs write."""
+    """Raise InputError for a folder with anything but a cohort of tetopt's, or with links where runs write."""
     if not os.path.lexists(out):
         if not out.absolute().parent.is_dir():
-            raise InputError(f"{out}: its folder does not exist; make it first")
+            raise InputError(f"{out}: its parent folder does not exist; create it first")
         return
     if not out.is_dir():
         raise InputError(f"{out}: expected a folder for the cohort, got a file")
     if any(out.iterdir()) and not is_cohort(out):
-        raise InputError(f"{out}: holds files that are no cohort's; name a new folder, or one that a cohort is in")
+        raise InputError(f"{out} is not a cohort folder; choose an empty one, or one of a cohort")
     for name in OWN_NAMES:
         if (wrong := not_our_file(out / name)) is not None:
             raise InputError(wrong)
@@ -94,37 +94,37 @@ def check_out(out: Path) -> None:
 
 
 def not_our_file(path: Path) -> str | None:
-    """What is wrong with a file of ours, if it is there and a link, a pipe or the like."""
+    """Return the problem of a file of tetopt's, if it is a link, a pipe or the like."""
     other = irregular(path, follow=False) if os.path.lexists(path) else None
-    return other and f"{path}: expected a regular file, got {other}; put the file itself there, or remove it"
+    return other and f"{path}: expected a regular file, got {other}; replace it by the file itself, or remove it"
 
 
 def not_our_files(out: Path, key: str) -> str | None:
-    """The same of what is read of a subject's outputs."""
+    """Return the problem of a subject's outputs that are read."""
     return not_our_file(numbers_path(out, key)) or not_our_picture(out, key)
 
 
 def not_our_picture(out: Path, key: str) -> str | None:
-    """The same of a subject's thumbnail, and of its folder, which tetopt makes inside the subject's."""
+    """Return the problem of a subject's thumbnail, and of its folder, which tetopt makes inside the subject's."""
     path = thumbnail_path(out, key)
     if path.parent.is_symlink():
-        return f"{path.parent}: expected a folder, got a link; put the folder itself there, or remove the link"
+        return f"{path.parent}: expected a folder, got a link; replace it by the folder itself, or remove the link"
     return not_our_file(path)
 
 
 def check_place(out: Path, key: str) -> None:
-    """InputError for a subject's folder that is a link: a run gives it another content by renaming."""
+    """Raise InputError for a subject's folder that is a link, as a run replaces its content by renaming."""
     place = subject_folder(out, key)
     for each in (place, place.parent):
         if each != out and each.is_symlink():
             raise InputError(
-                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would replace what "
-                "is there: move that folder back, or remove the link"
+                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would replace its "
+                "content: move that folder back, or remove the link"
             )
 
 
 def is_cohort(out: Path) -> bool:
-    """Whether a folder is one that `begin` made."""
+    """Return whether `begin` made a folder."""
     path = out / DESCRIPTION_NAME
     if not path.is_file():
         return False
@@ -137,7 +137,7 @@ def is_cohort(out: Path) -> bool:
 
 
 def begin(out: Path, sources: Sequence[str] = ()) -> None:
-    """Make the folder, and set down whose it is and of which data, if it is new: BIDS 1.10, of a derivative."""
+    """Make the folder if it is new, and describe its origin and data as a derivative of BIDS 1.10."""
     out.mkdir(exist_ok=True)
     (out / LOGS_NAME).mkdir(exist_ok=True)
     create(out / WORK_NAME, WORK)
@@ -149,17 +149,17 @@ def begin(out: Path, sources: Sequence[str] = ()) -> None:
         "SourceDatasets": [{"URL": source} for source in sources],
     }  # fmt: skip
     save_json(out / DESCRIPTION_NAME, description)
-    # BIDS has no names for meshes of volumes yet, nor for pages and logs; its patterns of folders have no "/".
+    # BIDS does not yet name meshes of volumes, pages and logs; its patterns of folders have no "/".
     (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
 
 
 def locked(out: Path, keys: list[str] | None = None) -> AbstractContextManager[None]:
-    """Within it no other run writes to the folder, or, with `keys`, none that writes the whole or these subjects."""
+    """Lock the folder against other runs, or, with `keys`, against runs that write the whole or these subjects."""
     return work_directory.locked(out / WORK_NAME, WORK, out, keys)
 
 
 def publish(work: Path, out: Path, key: str) -> None:
-    """Give what lies in `work` the subject's place, in one step, instead of what is there; see `restore`."""
+    """Replace a subject's outputs by those in `work`, in one step; see `restore`."""
     check_place(out, key)
     place, aside = subject_folder(out, key), out / WORK_NAME / f"{key}.before"
     place.parent.mkdir(exist_ok=True)
@@ -171,7 +171,7 @@ def publish(work: Path, out: Path, key: str) -> None:
 
 
 def _clear(aside: Path, place: Path, key: str) -> None:
-    """Take away what was in a subject's place before; the user's own, as notes or results of a solver, stays there."""
+    """Remove a subject's former outputs; the user's own files, such as notes or results of a solver, are kept."""
     for each in aside.iterdir() if aside.exists() else ():
         if not each.name.startswith(mesh_name(key, "")) and not (place / each.name).exists():
             os.rename(each, place / each.name)
@@ -179,9 +179,9 @@ def _clear(aside: Path, place: Path, key: str) -> None:
 
 
 def restore(out: Path, keys: list[str] | None = None) -> None:
-    """Put back what a crash has left between the two renamings of `publish`, and take away what runs left behind.
+    """Undo a crash between the two renamings of `publish`, and remove leftovers of runs.
 
-    Of these subjects, or, without `keys`, of all.
+    For these subjects, or, without `keys`, for all.
     """
     with opened(out / WORK_NAME, WORK) as work:
         for name, mode in sorted(work.own().items()):
@@ -189,13 +189,13 @@ def restore(out: Path, keys: list[str] | None = None) -> None:
                 continue
             if name.endswith(".before"):
                 _put_back(out / WORK_NAME / name, out, name.removesuffix(".before"))
-            # Without their files (run-..., seen-...) what a cluster still does for runs that were killed ends.
+            # Removing their files (run-..., seen-...) ends what a cluster still does for killed runs.
             if stat.S_ISDIR(mode) or (keys is None and name != MANIFEST_NAME and not name.endswith(LOCK_NAME)):
                 work.remove(name, mode)
 
 
 def _put_back(aside: Path, out: Path, key: str) -> None:
-    """Give a subject its folder again, or only what the user had put there, if a new one has its place."""
+    """Restore a subject's folder, or only the user's own files if a new folder replaced it."""
     check_place(out, key)
     place = subject_folder(out, key)
     if place.exists():
@@ -206,7 +206,7 @@ def _put_back(aside: Path, out: Path, key: str) -> None:
 
 
 def numbers_of(path: Path) -> dict[str, Any] | None:
-    """What a file of numbers holds; None if it is not there, or is not what a run of tetopt wrote."""
+    """Read a file of numbers; return None if it is missing, or was not written by a run of tetopt."""
     try:
         table = json.loads(own_bytes(path))
     except (OSError, ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""How like a subject's thumbnail is to the others': what is turned, cut off or of another contrast is seen by it."""
+"""Likeness of a subject's thumbnail to the others': it reveals flipped, cropped or different images."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from tetopt.report.thumbnail import SIDE_PIXELS
 from tetopt.system.incoming import own_bytes
 
-BLOCK_PIXELS = 4  # that are averaged along each side: the mesh's edges, which lie anywhere, are hardly seen then
-MEDIAN_PICTURES = 1000  # of which the median is taken, evenly many of all: more change it by a hundredth
-THUMBNAIL_BYTES = 32_768  # of one of ours at most: of noise they have half of that
+BLOCK_PIXELS = 4  # averaged along each side, which hides the edges of the mesh
+MEDIAN_PICTURES = 1000  # evenly spaced, for the median: more change it by a hundredth
+THUMBNAIL_BYTES = 32_768  # of one of tetopt's, at most: pictures of noise have half of that
 PICTURE_SIZES = ((SIDE_PIXELS, SIDE_PIXELS), (2 * SIDE_PIXELS, SIDE_PIXELS))  # width and height, in 2-D and 3-D
 
 
 class Likeness(NamedTuple):
-    """How like a picture is to the median of all, as correlations from -1 to 1."""
+    """Likeness of a picture to the median of all, as correlations from -1 to 1."""
 
     likeness: float
-    left_right: float  # how much more it is like the median with left and right exchanged; usually below 0
-    back_front: float  # likewise
-    upside_down: float  # likewise; nan in 2-D, where front and back are up and down in the picture
+    left_right: float  # excess correlation with the median with left and right exchanged; usually below 0
+    back_front: float  # with back and front exchanged
+    upside_down: float  # with up and down exchanged; nan in 2-D, where front and back are up and down
 
 
 def likenesses(paths: Sequence[Path | None]) -> list[Likeness | None]:
@@ -36,13 +36,13 @@ def likenesses(paths: Sequence[Path | None]) -> list[Likeness | None]:
     Parameters
     ----------
     paths : sequence of Path or None
-        Of thumbnails (`tetopt.report.thumbnail`).
+        Thumbnails (`tetopt.report.thumbnail`).
 
     Returns
     -------
     list of Likeness or None
-        Correlations of grey levels averaged over blocks of 4 x 4 pixels; None where there is no picture, no other of
-        its size, or it is of one grey.
+        Correlations of grey levels averaged over blocks of 4 x 4 pixels; None if there is no picture, no other of its
+        size, or only one grey.
     """
     groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
     greys: dict[int, NDArray[np.float32]] = {}
@@ -64,7 +64,7 @@ def likenesses(paths: Sequence[Path | None]) -> list[Likeness | None]:
 
 
 def _turned(picture: NDArray[np.floating]) -> list[NDArray[np.floating]]:
-    """The picture with left and right, back and front and, in 3-D, up and down exchanged."""
+    """Return the picture with left and right, back and front and, in 3-D, up and down exchanged."""
     axial, sagittal = picture[:, : len(picture)], picture[:, len(picture) :]
     pairs = [(axial[:, ::-1], sagittal), (axial[::-1], sagittal[:, ::-1])]
     pairs += [(axial, sagittal[::-1])] if sagittal.size else []
@@ -72,19 +72,19 @@ def _turned(picture: NDArray[np.floating]) -> list[NDArray[np.floating]]:
 
 
 def _centred(picture: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The picture with mean 0 and norm 1; zeros for one grey."""
+    """Return the picture with mean 0 and norm 1; zeros for one grey."""
     centred = picture - picture.mean()
     return centred / (np.linalg.norm(centred) or 1.0)
 
 
 def _grey(path: Path) -> NDArray[np.float32] | None:
-    """A picture's blocks, (32, 32 or 64), of mean 0 and norm 1; None if it is none of ours, or the same everywhere."""
+    """Return a picture's blocks, (32, 32 or 64), with mean 0 and norm 1; None if it is not tetopt's, or constant."""
     try:
         with PIL.Image.open(BytesIO(own_bytes(path, THUMBNAIL_BYTES)), formats=["PNG"]) as picture:
             if picture.size not in PICTURE_SIZES:
                 return None
             grey = np.asarray(picture.convert("L"), dtype=np.float32)
-    except (OSError, ValueError, SyntaxError):  # what Pillow says of a damaged PNG
+    except (OSError, ValueError, SyntaxError):  # Pillow's errors for a damaged PNG
         return None
     height, width = grey.shape
     blocks = grey.reshape(height // BLOCK_PIXELS, BLOCK_PIXELS, width // BLOCK_PIXELS, BLOCK_PIXELS).mean(axis=(1, 3))

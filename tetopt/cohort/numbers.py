@@ -1,4 +1,4 @@
-"""Every number of every subject, read from what their runs left behind, and as one table for other programs."""
+"""Every number of every subject, read from the outputs of their runs, and as one table for other programs."""
 
 from __future__ import annotations
 
@@ -34,42 +34,42 @@ from tetopt.system.incoming import toml_of
 
 Status = Literal["done", "violated", "failed", "missing"]
 Value = float | int | str | bool | None
-# Of run.json, not in the table: rows by iteration; sizes of sets, of which those of labels are in `labels`; pairs of
-# labels, of which there are sums; names and loads in words; what has columns by other names; the sentences that
-# `reason` has.
+# Parts of run.json that are not in the table: rows by iteration; sizes of sets, as `labels` has those of labels; pairs
+# of labels, as there are sums; names and loads as texts; values with columns of other names; the sentences in
+# `reason`.
 UNLISTED_NUMBERS = (
     "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "violated",
     "interfaces", "labels", "contacts", "thickness", "request",
 )  # fmt: skip
-SHORT_LIST = 4  # numbers of a list that have columns of their own: spacings, sides; more are moduli by the hundred
-NOT_AVAILABLE = "n/a"  # as BIDS writes a value that there is none of
-# Texts that a spreadsheet takes for formulas, by their first letter (OWASP, "CSV Injection"), in all widths.
+SHORT_LIST = 4  # numbers of a list with a column each, as spacings and sides; longer lists are hundreds of moduli
+NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
+# First letters of texts that spreadsheets read as formulas (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-FAILURE_COLUMNS = ("attempts", "seconds", "peak_bytes", "predicted_bytes")  # of a record of `tetopt.cohort.run`
-OBLIQUE_DIGITS = 1  # of degrees: an affine's float32 numbers hold no more of a turn
+FAILURE_COLUMNS = ("attempts", "seconds", "peak_bytes", "predicted_bytes")  # from a record of `tetopt.cohort.run`
+OBLIQUE_DIGITS = 1  # of degrees: the precision of an affine's float32 numbers
 COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
-LARGEST_COUNT = 2**63  # of whole numbers: more is no count of anything
+LARGEST_COUNT = 2**63  # of whole numbers: larger ones are not counts
 
 
 class Row(NamedTuple):
-    """One subject, as its run left it."""
+    """One subject, from the outputs of its run."""
 
     key: str  # "sub-01_ses-a"
     subject: str  # "sub-01"
     session: str  # "ses-a", or ""
-    # violated: a mesh, but a requirement is violated; missing: expected, and neither a mesh nor a failure
+    # violated: the mesh violates a requirement; missing: expected, with neither a mesh nor a failure
     status: Status
-    reason: str  # what failed, or which requirements are violated, on one line; "" for a subject that is done
+    reason: str  # failure or violated requirements, on one line; "" for a subject that is done
     violated: tuple[str, ...]  # the names of these requirements
-    files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": paths relative to OUT, of those there
+    files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": existing paths, relative to OUT
     numbers: dict[str, Value]  # by column
-    label_names: dict[int, str]  # of its labels that have one
+    label_names: dict[int, str]  # of its labels with a name
     volumes: dict[int, float]  # of its labels' voxels, mm^n
-    n_lost: dict[int, int]  # voxels of its labels that no cell carries
+    n_lost: dict[int, int]  # voxels of its labels without a cell
 
 
 def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
-    """The rows of all subjects in the folder of a cohort, and of those expected there, in the order of their names.
+    """Collect the rows of all subjects in a cohort's folder, and of expected ones, in the order of their names.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     Returns
     -------
     list of Row
-        With those of `tetopt.cohort.likeness` among their numbers. Files that cannot be read make a row that failed.
-        Where a run failed, the numbers of an older mesh beside it are left out.
+        Numbers include those of `tetopt.cohort.likeness`. A subject with unreadable files counts as failed. If a run
+        failed, the numbers of an older mesh are left out.
     """
     keys = {*_keys_there(out), *(expected or ())}
     rows = [row_of(out, key) for key in sorted(keys, key=natural_order)]
@@ -95,12 +95,12 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
 
 
 def natural_order(text: str) -> list[tuple[int, str]]:
-    """What to sort names by, so that "sub-2" comes before "sub-10"."""
+    """Return a sort key of names, so that "sub-2" comes before "sub-10"."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def _keys_there(out: Path) -> Iterator[str]:
-    """Keys of subjects with numbers or a failure in the cohort's folder."""
+    """Yield the keys of subjects with numbers or a failure in the cohort's folder."""
     for folder in _folders(out, "sub-"):
         for place in (folder, *_folders(folder, "ses-")):
             key = folder.name if place == folder else f"{folder.name}_{place.name}"
@@ -118,7 +118,7 @@ def _folders(folder: Path, beginning: str) -> list[Path]:
 
 
 def row_of(out: Path, key: str) -> Row:
-    """The row of one subject, by its key; see `collect`."""
+    """Return the row of one subject, by its key; see `collect`."""
     subject, _, session = key.partition("_")
     places = {
         "numbers": numbers_path(out, key),
@@ -130,11 +130,11 @@ def row_of(out: Path, key: str) -> Row:
     if "thumbnail" in there and not_our_picture(out, key) is not None:
         del there["thumbnail"]
     files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
-    row = Row(key, subject, session, "missing", "has not been run", (), files, {}, {}, {}, {})
+    row = Row(key, subject, session, "missing", "not run yet", (), files, {}, {}, {}, {})
     if (path := failure_path(out, key)).exists():
         failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
         numbers = {f"failure.{name}": _scalar(failure[name]) for name in FAILURE_COLUMNS if name in failure}
-        own = {name: file for name, file in files.items() if name == "log"}  # the rest is of an older mesh
+        own = {name: file for name, file in files.items() if name == "log"}  # the others belong to an older mesh
         return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), numbers=numbers, files=own)
     if "numbers" not in files:
         return row
@@ -145,12 +145,12 @@ def row_of(out: Path, key: str) -> Row:
 
 
 def _row_of_run(out: Path, row: Row, run: dict[str, Any]) -> Row:
-    """The row with the numbers of run.json, and the requirements that are violated."""
+    """Return the row with the numbers of run.json and the violated requirements."""
     path = numbers_path(out, row.key)
     meshes = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json")
     mesh = min(meshes, default=None)
     if mesh is None:
-        return row._replace(status="failed", reason="there are numbers and no mesh; run it again")
+        return row._replace(status="failed", reason="its mesh is missing, though there are numbers; run it again")
     violated = run["violated"] if isinstance(run.get("violated"), dict) else {}
     labels = [each for each in _table(run, "labels") if isinstance(each.get("label"), int)]
     names = run["label_names"] if isinstance(run.get("label_names"), dict) else {}
@@ -172,13 +172,13 @@ def _table(run: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def flattened(run: dict[str, Any]) -> dict[str, Value]:
-    """The numbers and texts of run.json by column, in its order.
+    """Return the numbers and texts of run.json by column, in its order.
 
-    Names of nested objects are joined by dots. Of labels there is a column a number, `labels.17.dice` and
-    `interfaces.17.area`; of contrasts `contrasts.1.weight` and so on; short lists of numbers have one each
-    (`spacing_mm.1`), lists of texts are joined. What was given as an option and is not among `options` anyway is in
-    `request.options`. Orientation and sides of the image are read from its affine. Left out are
-    `UNLISTED_NUMBERS`, and lists of more than four numbers.
+    Names of nested objects are joined by dots. Labels have a column per number, `labels.17.dice` and
+    `interfaces.17.area`; contrasts have `contrasts.1.weight` and so on; short lists of numbers have one column each
+    (`spacing_mm.1`), and lists of texts are joined. Given options that are not among `options` are in
+    `request.options`. Orientation and sides of the image come from its affine. `UNLISTED_NUMBERS` and lists of more
+    than four numbers are left out.
     """
     columns: dict[str, Value] = {}
     _put_grid(columns, run.get("box"))
@@ -200,7 +200,7 @@ def flattened(run: dict[str, Any]) -> dict[str, Value]:
 
 
 def _put(columns: dict[str, Value], name: str, value: Any) -> None:
-    """Enter a value, or those within it."""
+    """Add a value, or its nested values."""
     if name in UNLISTED_NUMBERS:
         return
     if isinstance(value, dict):
@@ -217,7 +217,7 @@ def _put(columns: dict[str, Value], name: str, value: Any) -> None:
 
 
 def _scalar(value: Any) -> Value:
-    """A text on one line; what is neither text nor a number that can be computed with as None."""
+    """Return a text on one line, or a finite number; None for anything else."""
     if isinstance(value, str):
         return plain(value)
     if isinstance(value, float):
@@ -226,7 +226,7 @@ def _scalar(value: Any) -> Value:
 
 
 def _put_grid(columns: dict[str, Value], box: Any) -> None:
-    """Enter how the image lies: its orientation, how oblique it is, its spacing and its shape."""
+    """Add the image's orientation, obliquity, spacing and shape."""
     try:
         affine = np.array(box["affine"], dtype=np.float64)
         shape = [int(each) for each in box["shape"]]
@@ -243,7 +243,7 @@ def _put_grid(columns: dict[str, Value], box: Any) -> None:
 
 
 def orientation_code(affine: np.ndarray) -> str:
-    """The world direction that each index axis runs in most, as "RAS" or "LPS"; in 2-D as "+x+y".
+    """Return the closest world direction of each index axis, as "RAS" or "LPS"; in 2-D as "+x+y".
 
     Examples
     --------
@@ -255,7 +255,7 @@ def orientation_code(affine: np.ndarray) -> str:
 
 
 def oblique_degrees(affine: np.ndarray) -> float:
-    """The largest angle between an index axis and its world axis, degrees, to a tenth.
+    """Return the largest angle between an index axis and its world axis, degrees, to a tenth.
 
     Examples
     --------
@@ -268,7 +268,7 @@ def oblique_degrees(affine: np.ndarray) -> float:
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
-    """The columns that any of the rows has, in the order of run.json, those of labels last and by number."""
+    """Return the columns of all rows, in the order of run.json, with those of labels last and by number."""
     names = list(dict.fromkeys(name for row in rows for name in row.numbers))
     is_of_label = [re.fullmatch(r"(labels|interfaces)\.\d+\..*", name) is not None for name in names]
     of_labels = [name for name, is_one in zip(names, is_of_label, strict=True) if is_one]
@@ -282,15 +282,15 @@ def column_names(rows: Sequence[Row]) -> list[str]:
 
 
 def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) -> None:
-    """Write every number of every subject as tab-separated text, whole or not at all, and beside it what they are.
+    """Write every number of every subject as tab-separated text, whole or not at all, with a description beside it.
 
     Parameters
     ----------
     path : Path
-        Of the table, `.tsv`; its columns are described in a file of the same name in `.json`, as BIDS has it.
+        Path of the table, `.tsv`; as in BIDS, a `.json` file of the same name describes its columns.
     rows : sequence of Row
     flags : sequence of sequence of str
-        What is odd about each of them.
+        Flags of each row.
     """
     names = column_names(rows)
     heads = ["participant_id", "session_id", "status", "reason", "flags"]
@@ -310,10 +310,10 @@ def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) 
 
 
 def field_text(value: Value) -> str:
-    r"""A value as a field of a table that pandas, R and spreadsheets read alike.
+    r"""Format a value as a field of a table that pandas, R and spreadsheets read equally.
 
-    Texts are on one line and without tabs (`tetopt.io.text.plain`); one with quotes is quoted, as in CSV; one that a
-    spreadsheet would take for a formula begins with an apostrophe.
+    Texts are on one line and without tabs (`tetopt.io.text.plain`); texts with quotes are quoted, as in CSV; texts that
+    a spreadsheet would read as a formula begin with an apostrophe.
 
     Examples
     --------
@@ -337,15 +337,15 @@ def _descriptions() -> dict[str, list[str]]:
 
 
 def description(column: str, label_names: dict[int, str] | None = None) -> dict[str, str]:
-    """What a column of the table is, and its unit, as BIDS's sidecars have it: "Description", "Units".
+    """Describe a column of the table and its unit, as in BIDS' sidecars: "Description", "Units".
 
-    `label_names` are put into those of labels. A column that nothing is known of is described by its name alone.
+    Descriptions of labels include their `label_names`. An unknown column is described by its name alone.
     """
     known, general = _descriptions(), re.sub(r"\.\d+(?=\.|$)", ".N", column)
     first, _, rest = general.partition(".")
     if first == "quality_initial" and f"quality.{rest}" in known:
         words, unit = known[f"quality.{rest}"]
-        words = f"Of the initial mesh: {words}"
+        words = f"Initial mesh: {words}"
     else:
         beginning = COLUMN_GROUPS.get(first)
         words, unit = known.get(general) or [f"{column} of run.json" if beginning is None else beginning + rest, ""]
@@ -356,5 +356,5 @@ def description(column: str, label_names: dict[int, str] | None = None) -> dict[
 
 
 def present(values: Iterable[Value]) -> list[float]:
-    """The numbers among some values."""
+    """Return the numbers among some values."""
     return [float(each) for each in values if isinstance(each, int | float) and not isinstance(each, bool)]

@@ -1,4 +1,4 @@
-"""A cohort at a glance: one page with its failures, its distributions, and a table of all subjects with pictures."""
+"""Overview page of a cohort: failures, distributions, and a table of all subjects with pictures."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from tetopt.errors import InputError
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
 from tetopt.system.incoming import own_bytes
 
-PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
-PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjects the flagged ones, and a sample
-LISTED_FAILURES = 100  # reasons, and subjects of one, above the table that has all
+PAGE_NUMBERS = 1_500_000  # in the page at most, about 10 MB: a browser on a phone reads them in seconds
+PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64; with more subjects, the flagged ones and a sample
+LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
-LISTED_FLAGS = 6  # of a subject; the table in TSV has all
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # of other files no byte comes into the page
+LISTED_FLAGS = 6  # per subject; the TSV table has all
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # other files are not embedded in the page
 SHOWN_DIGITS = 4  # of numbers in the page
-LISTED_VALUES = 6  # of an option that differs; of more it is said how many there are
-PICTURE_WORDS = "axial, left of the patient on the left, and sagittal, back on the left"
+LISTED_VALUES = 6  # of an option that differs; with more, only their number is shown
+PICTURE_WORDS = "axial, with the patient's left on the left, and sagittal, with the back on the left"
 COLOUR_WORDS = "Orange is the mesh, blue the outline of the mask, other colours are labels."
-# Columns of the page beside `QUANTITIES`, with their titles.
+# Columns of the page in addition to `QUANTITIES`, with their titles.
 PAGE_COLUMNS = {
     "grid.orientation": "orientation", "grid.spacing_mm": "voxels, mm", "grid.shape": "voxels",
     "size.n_nodes_in_all": "nodes", "quality.max_dihedral": "largest angle", "quality.n_under_10_degrees":
@@ -38,22 +38,22 @@ PAGE_COLUMNS = {
     "mask.components": "components of the mask", "mask.mesh_components": "components of the mesh",
     "memory.predicted_bytes": "memory predicted", "image": "image", "versions.tetopt": "version",
 }  # fmt: skip
-# Columns that are shown at first; those of the other quantities and of labels can be chosen.
+# Columns shown initially; those of the other quantities and of labels can be selected.
 FIRST_COLUMNS = (
     "grid.orientation", "energies.E_D_fraction_of_variance", "quality.mean_rho", "quality.min_dihedral", "mask.volume",
     "seconds.all", "memory.peak_bytes",
 )  # fmt: skip
 OPTION_BEGINNINGS = ("options.", "request.options.")  # of the columns of a run's options
-FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # by which the script knows what is there
+FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # tell the script which files exist
 STATUS_WORDS: dict[str, str] = {
     "done": "done", "violated": "with a violated requirement", "failed": "failed", "missing": "not run",
 }  # fmt: skip
 
 
 def save_cohort_files(out: Path, rows: Sequence[Row]) -> None:
-    """Write `cohort.tsv`, `cohort.json` with what its columns are, and `cohort.html` into a cohort's folder.
+    """Write `cohort.tsv`, `cohort.json` with descriptions of its columns, and `cohort.html` to a cohort's folder.
 
-    Each is written whole or not at all, over what is there.
+    Each is written whole or not at all, replacing an existing file.
     """
     flags = flags_of(rows)
     save_table(out / TABLE_NAME, rows, [[flag.words for flag in each] for each in flags])
@@ -66,18 +66,18 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     Parameters
     ----------
     path : Path
-        In the cohort's folder, as links are relative to it.
+        Path in the cohort's folder, as links are relative to it.
     out : Path
-        The cohort's folder, of the pictures.
+        The cohort's folder, with the pictures.
     rows : sequence of Row
     flags : sequence of sequence of Flag
-        What is odd about each of them; see `tetopt.cohort.flags.flags_of`.
+        Flags of each row; see `tetopt.cohort.flags.flags_of`.
 
     Notes
     -----
-    Everything is in the page but what it links to, and it forbids itself all network access. Numbers are rounded to
-    four digits; above `PAGE_NUMBERS` of them labels are left out, those that most subjects have last. Above
-    `PAGE_PICTURES` subjects only these have pictures in it: those that are flagged, and of the others every so many.
+    The page contains everything except linked files, and forbids all network access. Numbers are rounded to four
+    digits; above `PAGE_NUMBERS` of them, labels are left out, the most common ones last. Above `PAGE_PICTURES`
+    subjects, only flagged ones, and an evenly spaced sample of the others, have embedded pictures.
     """
     pictures = _pictures(out, rows, flags)
     names, left_out = _columns(rows)
@@ -87,11 +87,11 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     note += COLOUR_WORDS if n_pictures else ""
     if n_pictures < sum("thumbnail" in row.files for row in rows):
         note += (
-            f" The page has {n_pictures} of them: those of subjects that are flagged, and of the others a sample; the "
-            "rest is linked."
+            f" The page has {n_pictures} of them: those of flagged subjects, and a sample of the others; the rest is "
+            "linked."
         )
     if left_out:
-        note += f" Numbers of {left_out} more labels are in cohort.tsv alone."
+        note += f" Numbers of {left_out} more labels are only in cohort.tsv."
     reasons, subjects = _failures(rows), list(_first_subjects(rows, flags))
     content = rendered(
         "cohort/cohort.html", summary=_summary(rows, flags), reasons=reasons, most=LISTED_FAILURES, quote=quote,
@@ -103,41 +103,41 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
 
 
 def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
-    """How many subjects are done and so on, how long they took, and what they have in common."""
+    """Summarise the subjects' statuses, their time, and their common options."""
     counts = Counter[str](row.status for row in rows)
     words = [f"{counts[status]} {words}" for status, words in STATUS_WORDS.items() if counts[status]]
     text = f"{len(rows)} subject{'s' if len(rows) != 1 else ''}: {', '.join(words) or 'none'}."
     if n_odd := sum(bool(each) for each in flags):
-        text += f" {n_odd} {'is' if n_odd == 1 else 'are'} odd in something, see below."
+        text += f" {n_odd} {'is' if n_odd == 1 else 'are'} flagged, see below."
     if seconds := present(row.numbers.get("seconds.all") for row in rows):
-        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing; start-up and pictures of each come on top."
+        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing, without start-up and pictures."
     if peaks := present(row.numbers.get("memory.peak_bytes") for row in rows):
-        text += f" The largest run had {units('bytes', 3)(max(peaks))} of memory."
+        text += f" The largest run used {units('bytes', 3)(max(peaks))} of memory."
     options = _options(rows)
     common = [f"{_option(name)} {_shown(next(iter(each)))}" for name, each in options.items() if len(each) == 1]
     different = [f"{_option(name)}: {_counted(each)}" for name, each in options.items() if len(each) > 1]
     lines = [text, *unjudged(rows)]
     if common:
-        lines.append(f"Of all meshes: {', '.join(common)}.")
+        lines.append(f"Common to all meshes: {', '.join(common)}.")
     if different:
-        lines.append(f"Different, with how many subjects have each: {'; '.join(different)}.")
+        lines.append(f"Different, with numbers of subjects: {'; '.join(different)}.")
     return lines
 
 
 def _option(name: str) -> str:
-    """An option's name as the command line has it, or whose version it is."""
+    """Return an option's name on the command line, or the program of a version."""
     return name.rpartition(".")[2]
 
 
 def _counted(counts: Counter[Value]) -> str:
-    """Values and how many subjects have each, the most frequent first."""
+    """Format values with their numbers of subjects, the most frequent first."""
     if len(counts) > LISTED_VALUES:
         return f"{len(counts)} values"
     return ", ".join(f"{'none' if value is None else _shown(value)} ({n})" for value, n in counts.most_common())
 
 
 def _options(rows: Sequence[Row]) -> dict[str, Counter[Value]]:
-    """Version and options of the meshes: of each how many have which value; None where it is not stated."""
+    """Count the values of version and options over the meshes; None if not stated."""
     meshes = [row.numbers for row in rows if row.status in ("done", "violated")]
     stated = dict.fromkeys(name for numbers in meshes for name in numbers if name.startswith(OPTION_BEGINNINGS))
     counts = {name: Counter(numbers.get(name) for numbers in meshes) for name in ("versions.tetopt", *stated)}
@@ -145,7 +145,7 @@ def _options(rows: Sequence[Row]) -> dict[str, Counter[Value]]:
 
 
 def _failures(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
-    """The subjects that failed, those of one reason together, the most frequent first."""
+    """Group the failed subjects by reason, the most frequent first."""
     reasons: dict[str, list[Row]] = {}
     for row in rows:
         if row.status == "failed":
@@ -154,17 +154,17 @@ def _failures(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
 
 
 def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str | None]:
-    """Thumbnails in base64, of as many rows as the page may have: flagged ones first, and of the rest evenly many."""
+    """Return thumbnails in base64 for as many rows as allowed: flagged ones first, and evenly spaced others."""
     places = [place for place, row in enumerate(rows) if "thumbnail" in row.files]
     odd = sorted((place for place in places if flags[place]), key=lambda place: -flags[place][0].score)
     rest = [place for place in places if not flags[place]]
-    # At least a fifth shows what the usual ones are like.
+    # At least a fifth shows usual subjects.
     n_odd = min(len(odd), max(PAGE_PICTURES - len(rest), 4 * PAGE_PICTURES // 5))
     n_rest = min(len(rest), PAGE_PICTURES - n_odd)
     chosen = chain(odd[:n_odd], (rest[k * len(rest) // n_rest] for k in range(n_rest)))
     pictures: list[str | None] = [None] * len(rows)
     for place in chosen:
-        with suppress(OSError, InputError):  # a page without it
+        with suppress(OSError, InputError):  # the page does without it
             png = own_bytes(out / rows[place].files["thumbnail"], THUMBNAIL_BYTES)
             if png.startswith(PNG_SIGNATURE):
                 pictures[place] = base64.b64encode(png).decode("ascii")
@@ -172,7 +172,7 @@ def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -
 
 
 def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
-    """The page's columns, by name, and how many labels are left out."""
+    """Return the page's columns, by name, and the number of labels left out."""
     known = {name for row in rows for name in row.numbers}
     quantities = {each.column: each for each in QUANTITIES}
     columns = {name: quantities.get(name) for name in dict.fromkeys((*FIRST_COLUMNS, *quantities, *PAGE_COLUMNS))}
@@ -196,7 +196,7 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
 def _data(
     rows: Sequence[Row], flags: Sequence[Sequence[Flag]], pictures: Sequence[str | None], columns: dict[str, Quantity]
 ) -> dict[str, Any]:
-    """What the script works on."""
+    """Return the script's data."""
     is_flat = any(row.numbers.get("quality.ndim") == 2 for row in rows)
     return {
         "columns": [
@@ -215,7 +215,7 @@ def _data(
 
 
 def _row_data(row: Row, flags: Sequence[Flag], columns: Iterable[str]) -> list[Any]:
-    """A row as the script has it."""
+    """Return a row for the script."""
     letters = "".join(letter for name, letter in FILE_LETTERS.items() if name in row.files)
     own = [[flag.words, flag.column] for flag in flags[:LISTED_FLAGS]]
     fixed = [row.key, row.status, row.reason, own, len(flags), row.files.get("mesh", ""), letters]
@@ -223,12 +223,12 @@ def _row_data(row: Row, flags: Sequence[Flag], columns: Iterable[str]) -> list[A
 
 
 def _shown(value: Value) -> Value:
-    """A value as the page has it: of floats some digits."""
+    """Round a float for the page."""
     return float(f"{value:.{SHOWN_DIGITS}g}") if isinstance(value, float) else value
 
 
 def _first_subjects(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> Iterator[list[str]]:
-    """Rows of the first subjects, the odd ones before the others, for browsers without scripts."""
+    """Yield rows of the first subjects, the flagged ones before the others, for browsers without scripts."""
     for place in sorted(range(len(rows)), key=lambda place: -len(flags[place]))[:LISTED_SUBJECTS]:
         row = rows[place]
         odd = "; ".join(flag.words for flag in flags[place][:LISTED_FLAGS])

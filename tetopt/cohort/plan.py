@@ -1,4 +1,4 @@
-"""What a cohort is to do: all that can be refused before the first run is, and all of it is said."""
+"""Planning of a cohort: all problems are found before the first run, and all are reported."""
 
 from __future__ import annotations
 
@@ -41,27 +41,27 @@ class PlannedSubject(NamedTuple):
     subject: Subject
     key: str
     options: RunOptions
-    plan: Plan  # of its run, as far as it is known without its files
+    plan: Plan  # of its run, as far as known without its files
     state: SubjectState
 
     @property
     def job(self) -> JobOptions:
-        """What is asked for, with its images."""
+        """The subject's job, with its images."""
         return self.plan.job
 
     def row(self) -> Subject:
-        """The subject with the files that patterns mean for it."""
+        """Return the subject with the files that patterns match."""
         files = {name: path for name in FILE_OPTIONS if (path := getattr(self.options, name)) is not None}
         return self.subject._replace(files=files)
 
     def words(self) -> tuple[str, ...]:
-        """What follows `tetopt mesh`, without outputs and threads."""
+        """Return the arguments of `tetopt mesh`, without outputs and threads."""
         options = {name: value for name, value in given_options(self.options).items() if name != "threads"}
         return (*option_words(options), "--", *map(str, self.subject.images))
 
 
 def subjects_of(path: Path, cohort: CohortOptions) -> list[Subject]:
-    """The rows of a table, or of a BIDS folder, as far as they are chosen; InputError if there are none."""
+    """Return the selected rows of a table or a BIDS folder; raise InputError if there are none."""
     if path.is_dir():
         from tetopt.cohort.bids_folder import bids_subjects
 
@@ -81,20 +81,20 @@ def subjects_of(path: Path, cohort: CohortOptions) -> list[Subject]:
 
 
 def checked_suffix(text: str) -> str:
-    """The suffix of meshes' files; InputError for one that is no format's."""
+    """Return the suffix of meshes' files; raise InputError for an unknown one."""
     suffix = text.lower() if text.startswith(".") else f".{text.lower()}"
-    if suffix not in BUILT_IN:  # subjects are run by processes of their own, which know no others
+    if suffix not in BUILT_IN:  # subjects are run by separate processes, which know only these
         raise InputError(f"`mesh_format`: expected one of {', '.join(BUILT_IN)}, got {text}")
     return suffix
 
 
 def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str) -> list[PlannedSubject]:
-    """The subjects with their options, and what there is of each.
+    """Return the subjects with their options and states.
 
     Raises
     ------
     Problems
-        All that is wrong, of all subjects.
+        All problems of all subjects.
     """
     problems = [("", line) for line in doubled(subjects)]
     plans = _Plans(options, suffix)
@@ -112,12 +112,12 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
     if problems:
         raise Problems(list(_lines(problems)))
     if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:
-        note(f"comparing the inputs and options of {n_there} subjects that are there with what is asked for")
+        note(f"comparing inputs and options of {n_there} existing subjects with the requested ones")
     return with_states(entries, out, suffix)
 
 
 def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """A line for each problem, of (place, words); for those of the same words, one with the first place."""
+    """Yield a line for each problem (place, words); problems with the same words share a line with the first place."""
     places: dict[str, list[str]] = {}
     for place, words in problems:
         places.setdefault(words, []).append(place)
@@ -127,25 +127,25 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 class _Plans:
-    """Plans of subjects; options that several share are checked once."""
+    """Plans of subjects; shared options are checked once."""
 
     def __init__(self, options: RunOptions, suffix: str) -> None:
         mappings = {name: named_file(getattr(options, name) or "") for name in FILES_IN_TEXTS}
-        # A worker may be started in another folder.
+        # A worker may have another current folder.
         placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
         self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")
         self._patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
         self._known: dict[Any, tuple[RunOptions, Plan]] = {}
 
     def of(self, subject: Subject) -> tuple[RunOptions, Plan]:
-        """The options of a subject with its files, and its plan; InputError for options that cannot be."""
+        """Return a subject's options with its files, and its plan; raise InputError for invalid options."""
         files: dict[str, Any] = {
             name: of_each(name, pattern, partial(matching, subject=subject)) for name, pattern in self._patterns.items()
         } | subject.files
         kind = (tuple(sorted(subject.options.items())), tuple(sorted(files)), len(subject.images))
         if kind not in self._known:
             if "threads" in subject.options:
-                raise InputError("threads: all subjects have the same number, of `threads`; leave the column out")
+                raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
             own = with_options(self._options, {name.replace("_", "-"): text for name, text in subject.options.items()})
             own = replace(own, **files)
             places: dict[str, Any] = {"output": self._output, "figures": Path(FIGURES_NAME)}
@@ -155,17 +155,17 @@ class _Plans:
 
 
 def _missing(job: JobOptions) -> Iterator[str]:
-    """What is wrong with the files that a subject names: not there, or a text where an image should be."""
+    """Yield the problems of a subject's files: missing, broken links, or empty."""
     named = [("image", path) for path in job.images]
     whole = {name: path for name in FILE_OPTIONS if (path := getattr(job, name)) is not None and name != "tissues"}
     named += [*whole.items(), *(("tissues", path) for path in tissue_files(job.tissues))]
     for number, (name, path) in enumerate(named):
-        file = path if number == 0 else file_and_volume(path)[0]  # of the first, --volume tells which
+        file = path if number == 0 else file_and_volume(path)[0]  # --volume applies to the first
         try:
             if not os.path.lexists(file):
-                yield f"{name}: {path} is not there"
+                yield f"{name}: {path} does not exist"
             elif not file.exists():
-                yield f"{name}: {path} is a link to nothing; is its content fetched (datalad get)?"
+                yield f"{name}: {path} is a broken link; was its content fetched (datalad get)?"
             elif file.is_file() and file.stat().st_size == 0:
                 yield f"{name}: {path} is empty"
         except OSError as error:
@@ -173,7 +173,7 @@ def _missing(job: JobOptions) -> Iterator[str]:
 
 
 def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[PlannedSubject]:
-    """The subjects with what there is of each; files are summed up where there is a mesh to compare with."""
+    """Return the subjects with their states; checksums are computed only if there is a mesh to compare with."""
 
     def state(entry: PlannedSubject) -> PlannedSubject:
         request = None
@@ -186,7 +186,7 @@ def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[P
 
 
 def with_places(entries: list[PlannedSubject], out: Path) -> list[PlannedSubject]:
-    """The subjects to be run; Problems for those whose folder a run cannot replace."""
+    """Return the subjects to run; raise Problems for folders that a run cannot replace."""
     problems = []
     for entry in entries:
         try:
@@ -199,6 +199,6 @@ def with_places(entries: list[PlannedSubject], out: Path) -> list[PlannedSubject
 
 
 def chosen(entries: Iterable[PlannedSubject], only_failed: bool) -> list[PlannedSubject]:
-    """Those to be run."""
+    """Return the subjects to run."""
     statuses = ("failed",) if only_failed else ("missing", "failed", "changed")
     return [entry for entry in entries if entry.state.status in statuses]

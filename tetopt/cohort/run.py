@@ -1,6 +1,6 @@
-"""One subject: meshed by a process of its own, whose outputs take their place together, or why not is set down.
+"""One subject: meshed by its own process, whose outputs are published together, or whose failure is recorded.
 
-A worker runs it. All it takes and gives are names and numbers; what there is lies in files.
+A worker runs it. It exchanges only names and numbers; data are in files.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from tetopt.system.child import signal_words, started, watched
 from tetopt.system.files import save_json, save_text
 from tetopt.system.interpreter import python_command, python_environment
 
-LOOK_SECONDS = 0.2  # between two looks at a run: a hundredth of the shortest that is meant
-MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find the memory that the first did not
-ERROR_MARK = "tetopt: "  # what a line begins with that says why nothing came of a run
+LOOK_SECONDS = 0.2  # between two checks of a run: a hundredth of the shortest expected run
+MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find enough memory
+ERROR_MARK = "tetopt: "  # prefix of a line that states why a run failed
 WARNING_MARK = "tetopt: warning: "
 THREAD_NAMES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class SubjectTask(NamedTuple):
-    """A subject to be meshed."""
+    """A subject to mesh."""
 
     key: str
-    words: tuple[str, ...]  # of `tetopt mesh`, outputs left out
+    words: tuple[str, ...]  # arguments of `tetopt mesh`, without outputs
     out: str  # the cohort's folder
     suffix: str  # of the mesh's file
     threads: int
-    n_bytes: float  # of memory that are predicted
-    seconds: float  # likewise, of one thread
-    run: str  # the name of a file in the work directory: when it is gone, the run is given up
+    n_bytes: float  # predicted memory
+    seconds: float  # predicted, on one thread
+    run: str  # name of a file in the work directory: once it is removed, the run is abandoned
 
 
 class Ended(NamedTuple):
-    """How a subject's run ended."""
+    """The outcome of a subject's run."""
 
     key: str
     status: Literal["done", "violated", "failed", "given up"]
-    reason: str  # one line; empty if all went well
+    reason: str  # one line; empty without a failure
     seconds: float
     peak_bytes: int  # of resident memory
 
@@ -71,7 +71,7 @@ def run_subject(job: SubjectTask) -> Ended:
 
 
 def set_down(out: Path, job: SubjectTask, ended: Ended, attempts: int) -> None:
-    """Leave a file that says why a subject failed."""
+    """Write a file with a subject's failure."""
     save_json(
         failure_path(out, job.key),
         {
@@ -87,7 +87,7 @@ def set_down(out: Path, job: SubjectTask, ended: Ended, attempts: int) -> None:
 
 
 def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]:
-    """Run once; how it ended, and whether by a signal that is not ours."""
+    """Run once; return the outcome, and whether a foreign signal ended it."""
     out = Path(job.out)
     work = out / WORK_NAME / f"{job.key}.{job.run}.{os.getpid()}"
     shutil.rmtree(work, ignore_errors=True)
@@ -112,7 +112,7 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
     if child.returncode in (0, 1) and numbers is not None and mesh.is_file():
         publish(work, out, job.key)
         text = log.read_text(encoding="utf-8", errors="replace")
-        save_text(log, text.replace(str(work), str(subject_folder(out, job.key))))  # where its files are by now
+        save_text(log, text.replace(str(work), str(subject_folder(out, job.key))))  # the present place of its files
         failure_path(out, job.key).unlink(missing_ok=True)
         violated = "; ".join((numbers.get("violated") or {}).values())
         return Ended(
@@ -122,12 +122,12 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
     words = signal_words(child.returncode)
     reason = _reason(log, child.returncode) if words is None else f"ended by {words}"
     if words is not None and "SIGKILL" in words:
-        reason += f", as systems do that are short of memory; it had {peak / 1e9:.2g} GB"
+        reason += f", as systems do when memory runs out; it used {peak / 1e9:.2g} GB"
     return Ended(job.key, "failed", reason, seconds, peak), words is not None
 
 
 def _reason(log: Path, code: int) -> str:
-    """Why a run ended, in one line: the last that says so, or else the last."""
+    """Return why a run ended, in one line: the last error line, or else the last line."""
     text = log.read_text(encoding="utf-8", errors="replace")
     errors = [
         line.removeprefix(ERROR_MARK)

@@ -1,4 +1,4 @@
-"""Subjects as tasks of workers: how each ended, and why a file is set down of those that failed by their workers."""
+"""Subjects as tasks of workers: outcomes, and records of failures that workers caused."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ def run_all(
     room: float,
     task: Callable[[SubjectTask], Ended] = run_subject,
 ) -> Iterator[Ended]:
-    """Run subjects on a cluster of dask's; how each ended, as they do.
+    """Run subjects on a dask cluster; yield outcomes as they come.
 
     Parameters
     ----------
     jobs : sequence of SubjectTask
-        In the order in which they begin.
+        Tasks in the order in which they begin.
     client : distributed.Client
     slots : callable
-        How many may run at the same time, asked again and again.
+        Returns the number of simultaneous tasks; called repeatedly.
     room : float
-        Bytes of memory that one may take; a subject that is predicted to take more does not begin.
+        Bytes of memory for one task; a subject with a larger prediction does not begin.
     task : callable
-        What is run of each; it can be pickled.
+        Function to run for each; it can be pickled.
 
     Raises
     ------
     SchedulerLost
-        The scheduler is gone; what was finished is in its place.
+        The scheduler is gone; finished subjects are kept.
     """
     fitting = [job for job in jobs if job.n_bytes <= room]
     for job in jobs:
         if job.n_bytes > room:
-            reason = f"is predicted to take {memory_words(job.n_bytes)} of memory, a worker has {memory_words(room)}"
-            yield _failed(job, f"{reason}; ask for fewer nodes, or for larger workers", 0)
+            reason = f"needs {memory_words(job.n_bytes)} of memory (predicted), a worker has {memory_words(room)}"
+            yield _failed(job, f"{reason}; reduce the number of nodes, or use larger workers", 0)
     tasks = [(f"{job.key}-{job.run}", job) for job in fitting]
     for outcome in outcomes(client, slots, task, tasks, MOST_ATTEMPTS, repeats=Exception):
         if outcome.error is None:
@@ -52,7 +52,7 @@ def run_all(
 
 
 def _cause(error: BaseException) -> str:
-    """Why a subject has no result, in one line."""
+    """Return why a subject has no result, in one line."""
     if is_lost(error):
         return lost_words(MOST_ATTEMPTS)
     return last_line(" ".join(f"{type(error).__name__}: {error}".split()))

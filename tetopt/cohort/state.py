@@ -1,4 +1,4 @@
-"""What there is of each subject, by its outputs alone, and what is to be done and why."""
+"""State of each subject, from its outputs alone, and the reason to run it."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from typing import Any, Literal, NamedTuple
 from tetopt.cohort.layout import failure_path, mesh_name, not_our_files, numbers_of, numbers_path, subject_folder
 from tetopt.cohort.subjects import IMAGE_PATTERN
 
-Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": a mesh that violates a requirement
-WORDS_LISTED = 4  # of what has changed: a line's worth
+Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": the mesh violates a requirement
+WORDS_LISTED = 4  # changes that fit on a line
 
 
 class SubjectState(NamedTuple):
-    """What there is of a subject."""
+    """The state of a subject."""
 
     status: Status
-    why: str  # what has changed, why it failed; else empty
+    why: str  # changes, or the failure; else empty
 
 
 def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -> SubjectState:
-    """What there is of a subject.
+    """Return the state of a subject.
 
     Parameters
     ----------
     out : Path
     key : str
     suffix : str
-        Of its mesh's file.
+        Suffix of its mesh's file.
     request : dict, optional
-        What is asked for now, of `tetopt.job.request.requested`; without it what is there is not compared.
+        The current request, from `tetopt.job.request.requested`; without it, existing outputs are not compared.
     """
     numbers = numbers_of(numbers_path(out, key))
     failure = numbers_of(failure_path(out, key))
@@ -48,7 +48,7 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
 
 
 def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:
-    """What was asked of a run, empty where its numbers do not say so in the way that ours do."""
+    """Return the request of a run; empty if its numbers do not state one in tetopt's form."""
     request = numbers.get("request")
     if isinstance(request, dict) and all(isinstance(request.get(name), dict) for name in ("options", "files")):
         return request
@@ -56,22 +56,22 @@ def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:
 
 
 def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """In what two requests differ, in words."""
+    """Describe the differences of two requests."""
     words = []
     for name in sorted({*before["options"], *now["options"]}):
         pair = [str(each["options"].get(name, "none")) for each in (before, now)]
-        words += [f"{name} was {pair[0]}, is {pair[1]}"] if pair[0] != pair[1] else []
+        words += [f"{name} was {pair[0]}, now {pair[1]}"] if pair[0] != pair[1] else []
     for name in sorted({*before["files"], *now["files"]}):
         if before["files"].get(name) != now["files"].get(name):
             words.append(f"another {'image' if IMAGE_PATTERN.match(name) or name == 'images' else name}")
     if before.get("tetopt") != now["tetopt"]:
-        words.append(f"tetopt was {before.get('tetopt', 'none')}, is {now['tetopt']}")
+        words.append(f"tetopt was {before.get('tetopt', 'none')}, now {now['tetopt']}")
     more = f" and {len(words) - WORDS_LISTED} more" if len(words) > WORDS_LISTED else ""
     return "; ".join(words[:WORDS_LISTED]) + more
 
 
 def foreign_files(out: Path, key: str) -> str | None:
-    """What is wrong with what lies in a subject's place, if that is no subject's of ours."""
+    """Return the problem of a subject's folder, if its content is not a subject's of this cohort."""
     place = subject_folder(out, key)
     if not place.exists():
         return None
@@ -79,7 +79,7 @@ def foreign_files(out: Path, key: str) -> str | None:
         return wrong
     if numbers_path(out, key).is_file() and place.is_dir():
         sessions = [each.name for each in place.iterdir() if each.name.startswith("ses-")]
-        return f"{place}: has sessions, {sessions[0]} among them; give the subject one" if sessions else None
+        return f"{place}: has sessions, such as {sessions[0]}; give the subject one" if sessions else None
     if place.is_dir() and all(each.is_dir() and each.name.startswith("ses-") for each in place.iterdir()):
         return f"{place}: has sessions; give the subject one" if "_" not in key and any(place.iterdir()) else None
-    return f"{place}: holds something that is no subject's of this cohort; move it away"
+    return f"{place}: contains files that do not belong to this cohort; move them away"

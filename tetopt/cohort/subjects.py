@@ -1,4 +1,4 @@
-"""The subjects of a cohort: what is meshed of each, from a table, and as a table."""
+"""Subjects of a cohort: their images and options, read from and written to a table."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
 
 TABLE_SUFFIXES = (".tsv", ".csv")
-SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is BIDS's
+SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is from BIDS
 SESSION_COLUMNS = ("session", "session_id")
-FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")  # of `tetopt mesh`, that name a file
-NO_VALUES = ("", "n/a")  # of a cell that says nothing; the second is BIDS's
-LEFT_OUT = "#"  # what the name of a column begins with that is a note of the user's own
+FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")  # of `tetopt mesh`, with files
+NO_VALUES = ("", "n/a")  # of an empty cell; the second is from BIDS
+LEFT_OUT = "#"  # prefix of columns that are the user's notes
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
-KEY_LETTERS = 200  # of a subject's key: file systems take names of 255 bytes, and the longest adds 40 to it
+KEY_LETTERS = 200  # of a subject's key: file systems allow names of 255 bytes, and the longest adds 40
 GLOB_LETTERS = "*?["
 
 
 class Subject(NamedTuple):
-    """A subject, or a session of one, and what is its own."""
+    """A subject, or one of its sessions, with its own files and options."""
 
     subject: str  # without "sub-"
     session: str  # without "ses-"; empty for none
     images: tuple[Path, ...]
     files: dict[str, Path]  # by `FILE_OPTIONS`
     options: dict[str, str]  # by the names of `tetopt mesh`, with underscores, as text
-    place: str  # where it stands, for messages
+    place: str  # its place in the table, for messages
 
 
 class Problems(InputError):
-    """All that is wrong with a cohort, a line each."""
+    """All problems of a cohort, a line each."""
 
     def __init__(self, lines: Sequence[str]) -> None:
         super().__init__("; ".join(lines))
@@ -47,7 +47,7 @@ class Problems(InputError):
 
 
 def label_of(name: str) -> str:
-    """A name as a BIDS label: without what is neither letter nor digit.
+    """Convert a name to a BIDS label, which has only letters and digits.
 
     BIDS 1.10, Common principles, https://bids-specification.readthedocs.io: entities' labels are alphanumeric.
     """
@@ -55,22 +55,22 @@ def label_of(name: str) -> str:
 
 
 def key(subject: Subject) -> str:
-    """What its files are called, e.g. "sub-01_ses-a"."""
+    """Return the base name of a subject's files, e.g. "sub-01_ses-a"."""
     session = f"_ses-{label_of(subject.session)}" if subject.session else ""
     return f"sub-{label_of(subject.subject)}{session}"
 
 
 def read_table(path: Path) -> list[Subject]:
-    """The subjects of a table, a line each; its first line has the columns' names.
+    """Read the subjects of a table, a line each; its first line has the columns' names.
 
     `subject` (or `participant_id`), `session`, `image`, `image_2` and so on, `mask`, `labels`, and any other option of
-    `tetopt mesh` for the subject alone. Paths are relative to the table. Cells that are empty, or "n/a", say nothing;
-    a column whose name begins with # is left out.
+    `tetopt mesh` for the subject alone. Paths are relative to the table. Empty cells and "n/a" are ignored, as are
+    columns whose names begin with #.
 
     Raises
     ------
     Problems
-        Everything that is wrong with the table as such.
+        All problems of the table itself.
     """
     folder = path.parent.resolve()
     names, *lines = _cells(path)
@@ -80,12 +80,12 @@ def read_table(path: Path) -> list[Subject]:
     for number, line in lines:
         place = f"{path}, line {number}"
         if len(line) != len(columns):
-            problems.append(f"{place}: expected {len(columns)} cells, as the first line has, got {len(line)}")
+            problems.append(f"{place}: expected {len(columns)} cells as in the first line, got {len(line)}")
             continue
         cells = {name: cell for name, cell in zip(columns, line, strict=True) if name and cell not in NO_VALUES}
         images = sorted((name for name in cells if IMAGE_PATTERN.match(name)), key=_image_number)
         if missing := [name for name in ("subject", "image") if name not in cells]:
-            problems.append(f"{place}: has no {' and no '.join(missing)}")
+            problems.append(f"{place}: missing {' and '.join(missing)}")
             continue
         options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
         named = [name for name in FILE_OPTIONS if name in options]
@@ -100,12 +100,12 @@ def read_table(path: Path) -> list[Subject]:
     if problems:
         raise Problems(problems)
     if not subjects:
-        raise InputError(f"{path}: has no subjects; expected a line for each below the columns' names")
+        raise InputError(f"{path}: expected a line for each subject below the columns' names, got none")
     return subjects
 
 
 def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
-    """What is wrong with the subjects' names, a line each: none left, too long, alike, with and without a session."""
+    """Yield the problems of the subjects' names: empty, too long, repeated, with and without a session."""
     places: dict[str, str] = {}
     for each in subjects:
         if not label_of(each.subject) or (each.session and not label_of(each.session)):
@@ -113,20 +113,20 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             continue
         name = key(each)
         if len(name) > KEY_LETTERS:
-            words = f"{name[:20]}... has {len(name)} letters, by which files are called"
+            words = f"{name[:20]}... has {len(name)} letters, for names of files"
             yield f"{each.place}: {words}; expected at most {KEY_LETTERS}"
             continue
         if name in places:
-            yield f"{each.place}: {name} is also that of {places[name]}; give each its own subject or session"
+            yield f"{each.place}: {name} is also used by {places[name]}; make subject or session unique"
         places.setdefault(name, each.place)
     for name, place in places.items():
         if "_ses-" in name and name.partition("_")[0] in places:
             bare = name.partition("_")[0]
-            yield f"{place}: {name} has a session, {bare} ({places[bare]}) has none; give both one"
+            yield f"{place}: {name} has a session, {bare} ({places[bare]}) has none; add a session to both"
 
 
 def table_text(path: Path, subjects: Sequence[Subject]) -> str:
-    """The subjects as a table that lies at `path`, for `read_table`."""
+    """Format the subjects as a table at `path`, for `read_table`."""
     folder = path.parent.resolve()
     n_images = max((len(each.images) for each in subjects), default=1)
     images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
@@ -149,7 +149,7 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
 
 
 def of_each(option: str, path: Path | str, function: Callable[[str], Path | str]) -> Path:
-    """What a function makes of an option's file; of tissues, of each of the files between its commas."""
+    """Apply a function to an option's file; for tissues, to each of the comma-separated files."""
     parts = str(path).split(",") if option == "tissues" else [str(path)]
     return Path(",".join(str(function(part.strip())) for part in parts))
 
@@ -160,10 +160,10 @@ def write_table(path: Path, subjects: Sequence[Subject]) -> None:
 
 
 def matching(pattern: str, subject: Subject) -> Path:
-    """The one file that a pattern of all subjects means for this one.
+    """Return the one file of this subject that a pattern matches.
 
-    {subject} and {session} stand for its names as in `key`; where it has no session, "ses-{session}" goes with the "_"
-    or "/" before or after it. *, ? and [...] are as in a shell.
+    {subject} and {session} are its names as in `key`; without a session, "ses-{session}" is removed with the "_" or "/"
+    before or after it. *, ? and [...] are as in a shell.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def matching(pattern: str, subject: Subject) -> Path:
     """
     words = pattern
     if unknown := [name for name in re.findall(r"\{[a-z_]+\}", pattern) if name not in ("{subject}", "{session}")]:
-        raise InputError(f"{pattern}: there is no {unknown[0]}; write {{subject}} and {{session}}")
+        raise InputError(f"{pattern}: unknown placeholder {unknown[0]}; use {{subject}} and {{session}}")
     if not subject.session:
         words = re.sub(r"_ses-\{session\}|ses-\{session\}[_/]?", "", words)
     words = words.replace("{subject}", label_of(subject.subject)).replace("{session}", label_of(subject.session))
@@ -187,7 +187,7 @@ def matching(pattern: str, subject: Subject) -> Path:
 
 
 def _cells(path: Path) -> list[tuple[int, list[str]]]:
-    """The lines of a table with their numbers, as cells; those that are empty left out."""
+    """Return the non-empty lines of a table with their numbers, as cells."""
     text = text_of(path, "table of subjects")
     first = text.partition("\n")[0]
     separator = "\t" if path.suffix.lower() == ".tsv" else ";" if ";" in first and "," not in first else ","
@@ -195,14 +195,14 @@ def _cells(path: Path) -> list[tuple[int, list[str]]]:
     try:
         lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
     except csv.Error as error:
-        raise InputError(f"{path}, line {reader.line_num}: expected a table, {error}; mend that line") from error
+        raise InputError(f"{path}, line {reader.line_num}: expected a table, got {error}; correct that line") from error
     if not lines:
-        raise InputError(f"{path}: is empty; expected a first line with the columns' names, such as subject and image")
+        raise InputError(f"{path}: expected a line of columns' names, such as subject and image, got an empty file")
     return lines
 
 
 def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
-    """The columns by the names that are used here; "" of those that are left out."""
+    """Return the columns by their internal names; "" for ignored ones."""
     columns = []
     for cell in first[1]:
         name = cell.lower().replace("-", "_")
@@ -210,18 +210,18 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
         columns.append("" if name.startswith(LEFT_OUT) else name)
     named = [name for name in columns if name]
     if twice := sorted({name for name in named if named.count(name) > 1}):
-        raise InputError(f"{path}: the column {twice[0]} stands there {named.count(twice[0])} times; leave one")
+        raise InputError(f"{path}: the column {twice[0]} occurs {named.count(twice[0])} times; keep one")
     if missing := [name for name in ("subject", "image") if name not in named]:
         separator = "tabs" if path.suffix.lower() == ".tsv" else "commas"
         raise InputError(
             f"{path}: expected columns subject and image, between {separator}, got {', '.join(named) or 'none'}; "
-            f"there is no {' and no '.join(missing)}"
+            f"missing {' and '.join(missing)}"
         )
     return columns
 
 
 def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
-    """The files that the texts of a subject's options name."""
+    """Yield the files that texts of a subject's options name."""
     for name in FILES_IN_TEXTS:
         if (file := named_file(options.get(name, ""))) is not None:
             yield name, file

@@ -1,1 +1,1 @@
-"""Meshes as other libraries and notebooks hold and show them."""
+"""Conversion of meshes to and from other libraries, and their display in notebooks."""

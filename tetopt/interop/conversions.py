@@ -1,6 +1,6 @@
-"""Meshes as other libraries hold them, and back: plain arrays, so that `tetopt.mesh` and the readers of files share it.
+"""Conversion of meshes to and from other libraries, on plain arrays, so that `tetopt.mesh` and file readers share it.
 
-The libraries are imported where they are needed: a mesh alone takes none of them.
+The libraries are imported only where they are needed: a mesh by itself needs none of them.
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ from tetopt.system.extras import install_hint
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
 
-# The dimension of each kind of cell that a mesh may consist of, or that may lie on it.
+# The dimension of each cell type that a mesh may contain, or that may lie on it.
 CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
-# What the kinds of order 2 are by their corners; pyvista's names and meshio's. All have the nodes of VTK's order.
+# The linear type of each quadratic cell type, by the names of pyvista and meshio. All number nodes as VTK does.
 CORNER_KINDS = {
     "quadratic_edge": "line", "quadratic_triangle": "triangle", "quadratic_tetra": "tetra",
     "line3": "line", "triangle6": "triangle", "tetra10": "tetra",
 }  # fmt: skip
-# VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
+# VTK's arbitrary-order types with their number of nodes, as dolfinx writes them, and the equivalent fixed-order types.
 LAGRANGE_KINDS = {
     "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
     "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
     "lagrange_tetrahedron 10": "quadratic_tetra",
 }  # fmt: skip
-# Nodes of a cell, of the kinds that have a fixed number; without pyvista's other kinds, which are refused by name.
+# Nodes per cell of the types with a fixed number; pyvista's other types are missing here and are refused by name.
 NODES_OF_KIND = {
     "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
     "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
 }  # fmt: skip
-VTK_KINDS = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers of cells, by dimension and order
-MESHIO_KINDS = {(2, 1): "triangle", (3, 1): "tetra", (2, 2): "triangle6", (3, 2): "tetra10"}  # meshio's, likewise
-PACKAGES = {"skfem": "scikit-fem"}  # what is installed under another name than it is imported by
+VTK_KINDS = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's cell types, by dimension and order
+MESHIO_KINDS = {(2, 1): "triangle", (3, 1): "tetra", (2, 2): "triangle6", (3, 2): "tetra10"}  # and meshio's
+PACKAGES = {"skfem": "scikit-fem"}  # libraries whose package name differs from their import name
 
-Fields = Mapping[str, ArrayLike]  # by name, a row a cell or a row a node
+Fields = Mapping[str, ArrayLike]  # by name, one row per cell or per node
 
 
 class Simplices(NamedTuple):
-    """The cells of the highest dimension among others, and their corners."""
+    """The cells of the highest dimension in a mesh, and their corners."""
 
-    points: NDArray[np.float64]  # (N, n), those that the cells use, in their order
-    cells: NDArray[np.int64]  # (M, n+1), turned where they were inverted
-    used: NDArray[np.int64]  # (N,) numbers of the points among all
+    points: NDArray[np.float64]  # (N, n), the points that the cells use, in their original order
+    cells: NDArray[np.int64]  # (M, n+1), reoriented where they were inverted
+    used: NDArray[np.int64]  # (N,) indices of these points among all points
     n_turned: int
 
 
 def library(name: str, caller: str) -> Any:
-    """A library by the name that it is imported by; InputError if it is not installed."""
+    """Import a library by its import name; InputError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -72,22 +72,22 @@ def library(name: str, caller: str) -> Any:
 
 
 def corner_kinds(kinds: Collection[str]) -> dict[str, str]:
-    """The kinds of order 2 that are to be called as what they are by their corners, as none of these is there."""
+    """Map quadratic cell types to the linear type of their corners, unless that type occurs too."""
     renamed = {kind: CORNER_KINDS[kind] for kind in kinds if kind in CORNER_KINDS}
     return {kind: corner for kind, corner in renamed.items() if corner not in kinds}
 
 
 def kind_of_cells(kinds: Collection[str]) -> str:
-    """ "tetra" or "triangle": that of the highest dimension, those of order 2 being called by `corner_kinds`.
+    """Return "tetra" or "triangle", the type of highest dimension; quadratic types are renamed by `corner_kinds`.
 
     Raises
     ------
     InputError
-        Neither is there; another kind is; or cells of both orders.
+        Neither type occurs, another type occurs, or the cells have both orders.
     """
     unknown = sorted(set(kinds) - set(CELL_DIMENSIONS))
     if both := sorted(CORNER_KINDS[name] for name in unknown if name in CORNER_KINDS):
-        raise InputError(f"expected cells of one order, found {both[0]} cells of order 1 and of order 2")
+        raise InputError(f"expected cells of one order, found {both[0]} cells of both order 1 and order 2")
     if unknown:
         raise InputError(f"expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}")
     kind = max(kinds, key=lambda name: CELL_DIMENSIONS[name], default="none")
@@ -99,39 +99,39 @@ def kind_of_cells(kinds: Collection[str]) -> str:
 def simplices_of(
     points: NDArray[np.float64], cells: NDArray[np.int64], middles: NDArray[np.int64] | None = None
 ) -> Simplices:
-    """Cells over points in space as a mesh takes them.
+    """Convert cells over points in space to the arrays of a mesh.
 
     Parameters
     ----------
     points : (P, 3) float64
-        Also those that no cell uses.
+        May include points that no cell uses.
     cells : (M, 4) or (M, 3) int64
         Corners of tetrahedra, or of triangles in the plane z = 0.
     middles : (M, 6 or 3) int64, optional
-        Further nodes of cells of order 2.
+        The mid-edge nodes of cells of order 2.
 
     Raises
     ------
     InputError
-        Nodes that there are not, triangles out of the plane.
+        Cells refer to missing nodes, or triangles lie outside the plane.
     """
     n = cells.shape[1] - 1
     nodes = cells if middles is None else np.column_stack([cells, middles])
     if nodes.min() < 0 or nodes.max() >= len(points):
-        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, it holds 0..{len(points) - 1}; damaged?")
+        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, it has 0..{len(points) - 1}; damaged?")
     if n == 2 and np.any(points[nodes, 2] != 0.0):
-        raise InputError("a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
+        raise InputError("a triangle mesh must lie in the plane z = 0; surfaces in space are not supported")
     used, compact = np.unique(cells, return_inverse=True)
     corners, compact = points[used, :n], compact.reshape(cells.shape)
-    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses in words
+    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses with a message
         turned = oriented(corners, compact)
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
 
 
 def rows_by_kind(sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]) -> dict[str, NDArray[np.int64]]:
-    """Which cells, of `sizes` nodes and VTK's types, are of each kind by pyvista's names.
+    """Group cells, given their numbers of nodes and VTK types, by pyvista's names of the types.
 
-    Those of any number of nodes are of the kinds of fixed size that they stand for.
+    Cells of arbitrary order are grouped with the fixed-size type that they are equivalent to.
     """
     import pyvista
 
@@ -152,18 +152,18 @@ def rows_by_kind(sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]) -> dic
 def cells_of_rows(
     connectivity: NDArray[np.int64], offsets: NDArray[np.int64], rows_of_kind: Mapping[str, NDArray[np.int64]]
 ) -> dict[str, NDArray[np.int64]]:
-    """The nodes of VTK's cells, (M, w) of each kind; of a polyline, which may be of several widths, the first ones."""
+    """Return the nodes of VTK's cells, (M, w) for each type; polylines of varying length keep their first nodes."""
     sizes, cells = np.diff(offsets), {}
     for kind, chosen in rows_of_kind.items():
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
-            raise InputError(f"damaged: cells of {NODES_OF_KIND[kind]} nodes ({kind}) have another number of them")
+            raise InputError(f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, some have another number")
         cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
     return cells
 
 
 def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]) -> Simplices:
-    """The tetrahedra, else the triangles, among cells by kind; of order 2 by their corners."""
+    """Select the tetrahedra, or else the triangles, from cells by type; cells of order 2 by their corners."""
     try:
         places = np.asarray(points)
         places = np.asarray(places, dtype=None if places.dtype.kind == "c" else np.float64)
@@ -171,7 +171,7 @@ def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64
         raise InputError(f"{caller}: expected points of real numbers ({error})") from error
     if places.dtype.kind == "c" or places.ndim != 2 or places.shape[1] not in (2, 3):
         words = f"got {places.dtype} of shape {places.shape}"
-        raise InputError(f"{caller}: expected points of two or three real numbers, {words}")
+        raise InputError(f"{caller}: expected points with two or three real coordinates, {words}")
     in_space = np.zeros((len(places), 3))
     in_space[:, : places.shape[1]] = places
     renamed = corner_kinds(cells)
@@ -179,11 +179,11 @@ def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64
         kind = kind_of_cells([renamed.get(name, name) for name in cells])
         name = next(name for name in cells if renamed.get(name, name) == kind)
         n_corners = CELL_DIMENSIONS[kind] + 1
-        width = n_corners if name == kind else n_corners * (n_corners + 1) // 2  # a node in the middle of each edge
+        width = n_corners if name == kind else n_corners * (n_corners + 1) // 2  # one mid-edge node per edge
         nodes = np.asarray(cells[name])
         if nodes.dtype.kind not in "iu" or nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
             raise InputError(
-                f"expected {name} cells of {width} whole numbers each, got {nodes.dtype} of shape {nodes.shape}"
+                f"expected {name} cells of {width} integers each, got {nodes.dtype} of shape {nodes.shape}"
             )
         nodes = nodes.astype(np.int64)
         return simplices_of(in_space, nodes[:, :n_corners], nodes[:, n_corners:])
@@ -192,13 +192,13 @@ def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64
 
 
 def from_pyvista(grid: Any) -> Simplices:
-    """The simplices of one of pyvista's or VTK's grids; see `tetopt.mesh.Mesh.from_pyvista`."""
+    """Return the simplices of a pyvista or VTK grid; see `tetopt.mesh.Mesh.from_pyvista`."""
     pyvista = library("pyvista", "from_pyvista")
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkDataSet
 
     if not isinstance(grid, vtkDataSet):
-        raise InputError(f"from_pyvista: expected one of pyvista's grids of cells, got {type(grid).__name__}")
+        raise InputError(f"from_pyvista: expected a pyvista or VTK grid, got {type(grid).__name__}")
     shown = pyvista.wrap(grid)
     whole = shown if isinstance(shown, pyvista.UnstructuredGrid) else shown.cast_to_unstructured_grid()
     if whole.n_cells == 0:
@@ -211,7 +211,7 @@ def from_pyvista(grid: Any) -> Simplices:
 
 
 def from_meshio(mesh: Any) -> Simplices:
-    """The simplices of a `meshio.Mesh`; see `tetopt.mesh.Mesh.from_meshio`."""
+    """Return the simplices of a `meshio.Mesh`; see `tetopt.mesh.Mesh.from_meshio`."""
     meshio = library("meshio", "from_meshio")
     if not isinstance(mesh, meshio.Mesh):
         raise InputError(f"from_meshio: expected a meshio.Mesh, got {type(mesh).__name__}; meshio.read(path) reads one")
@@ -224,11 +224,11 @@ def from_meshio(mesh: Any) -> Simplices:
 
 
 def from_skfem(mesh: Any) -> Simplices:
-    """The simplices of one of scikit-fem's meshes; see `tetopt.mesh.Mesh.from_skfem`."""
+    """Return the simplices of a scikit-fem mesh; see `tetopt.mesh.Mesh.from_skfem`."""
     skfem = library("skfem", "from_skfem")
     if not isinstance(mesh, skfem.Mesh) or len(mesh.t) != mesh.dim() + 1 or mesh.dim() not in (2, 3):
         kind = type(mesh).__name__
-        raise InputError(f"from_skfem: expected one of scikit-fem's MeshTri or MeshTet, got {kind}")
+        raise InputError(f"from_skfem: expected a scikit-fem MeshTri or MeshTet, got {kind}")
     return _picked("from_skfem", mesh.p.T, {"tetra" if mesh.dim() == 3 else "triangle": mesh.t.T})
 
 
@@ -236,7 +236,7 @@ def from_skfem(mesh: Any) -> Simplices:
 
 
 def checked_fields(what: str, fields: Fields | None, n_rows: int) -> dict[str, NDArray]:
-    """Arrays of numbers by name; InputError unless each has so many rows."""
+    """Return arrays of numbers by name; InputError unless each has `n_rows` rows."""
     if not isinstance(fields, Mapping | None):
         raise InputError(f"{what}: expected a dict of arrays by name, got {type(fields).__name__}")
     arrays: dict[str, NDArray] = {}
@@ -249,7 +249,7 @@ def checked_fields(what: str, fields: Fields | None, n_rows: int) -> dict[str, N
         if values.dtype.kind not in "biuf" or values.ndim == 0 or len(values) != n_rows or values.size == 0:
             raise InputError(f"{line}, got {values.dtype} of shape {values.shape}")
         if not isinstance(name, str):
-            raise InputError(f"{what}: expected a text as the name of data, got {name!a}")
+            raise InputError(f"{what}: expected strings as names, got {name!a}")
         arrays[name] = values
     return arrays
 
@@ -261,8 +261,8 @@ def vtk_grid(
     cell_data: Mapping[str, NDArray],
     point_data: Mapping[str, NDArray],
 ) -> vtkUnstructuredGrid:
-    """Cells of one of VTK's kinds over points in the plane, which is z = 0, or in space, with their data."""
-    # VTK without pyvista, and only here: files are written by the quickest of runs, too.
+    """Build a VTK grid from cells of one VTK type, with data; points in the plane get z = 0."""
+    # VTK without pyvista, imported only here: even the shortest run writes files.
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
@@ -285,12 +285,12 @@ def vtk_grid(
 
 
 def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
-    """Add an array of numbers; the first on cells, or on points, is the one that programs show."""
+    """Add an array of numbers; programs show the first one on cells or on points by default."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
 
     values = np.asarray(values)
-    # VTK takes numbers in the machine's order of bytes, whatever their type says, and floats of four or eight bytes.
+    # VTK assumes the machine's byte order, whatever the dtype says, and floats of four or eight bytes.
     is_odd = values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8)
     values = values.astype(np.float64 if is_odd else values.dtype.newbyteorder("="), copy=False)
     values = values.reshape(len(values), math.prod(values.shape[1:])) if values.ndim > 1 else values
@@ -305,7 +305,7 @@ def to_pyvista(
     points: NDArray[np.float64], cells: NDArray[np.int64], kind: int, cell_data: Fields | None,
     point_data: Fields | None,
 ) -> Any:  # fmt: skip
-    """Cells of one of VTK's kinds and their data as a `pyvista.UnstructuredGrid`."""
+    """Convert cells of one VTK type and their data to a `pyvista.UnstructuredGrid`."""
     pyvista = library("pyvista", "to_pyvista")
     on_cells = checked_fields("cell_data", cell_data, len(cells))
     on_points = checked_fields("point_data", point_data, len(points))
@@ -316,7 +316,7 @@ def to_meshio(
     points: NDArray[np.float64], cells: NDArray[np.int64], kind: str, cell_data: Fields | None,
     point_data: Fields | None,
 ) -> Any:  # fmt: skip
-    """Cells of one of meshio's kinds and their data as a `meshio.Mesh`, of copies."""
+    """Convert cells of one meshio type and their data to a `meshio.Mesh`; arrays are copied."""
     meshio = library("meshio", "to_meshio")
     on_cells = checked_fields("cell_data", cell_data, len(cells))
     on_points = checked_fields("point_data", point_data, len(points))
@@ -329,15 +329,15 @@ def to_meshio(
 
 
 def to_skfem(points: NDArray[np.float64], cells: NDArray[np.int64]) -> Any:
-    """A `skfem.MeshTri` or `skfem.MeshTet`."""
+    """Convert a mesh to a `skfem.MeshTri` or `skfem.MeshTet`."""
     skfem = library("skfem", "to_skfem")
     kind = skfem.MeshTet if points.shape[1] == 3 else skfem.MeshTri
-    # Contiguous, or scikit-fem warns of making them so.
+    # Contiguous arrays: otherwise scikit-fem copies them and warns about it.
     return kind(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
 
 
 def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any:
-    """Triangles in space, and the points that they use, as a `trimesh.Trimesh`."""
+    """Convert triangles in space, and the points that they use, to a `trimesh.Trimesh`."""
     trimesh = library("trimesh", "to_trimesh")
     used, faces = np.unique(triangles, return_inverse=True)
     return trimesh.Trimesh(points[used], faces.reshape(triangles.shape), process=False)
@@ -346,7 +346,7 @@ def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any
 def show_grid(
     grid: Any, name: str | None, screenshot: str | Path | None, off_screen: bool | None, look: dict[str, Any]
 ) -> Any:
-    """Show one of pyvista's grids, coloured by its field of a name; see `tetopt.mesh.Mesh.plot`."""
+    """Show a pyvista grid, coloured by the named field; see `tetopt.mesh.Mesh.plot`."""
     pyvista = library("pyvista", "plot")
     if off_screen is None:
         has_none = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -359,9 +359,9 @@ def show_grid(
     if off_screen or screenshot is not None:
         try:
             return plotter.screenshot(None if screenshot is None else str(screenshot), return_img=True)
-        except (OSError, ValueError) as error:  # no such folder, or no such kind of picture
+        except (OSError, ValueError) as error:  # no such folder, or an unknown picture format
             words = " ".join(str(error).split())
-            raise InputError(f"plot: {screenshot}: the picture cannot be written ({words})") from error
+            raise InputError(f"plot: {screenshot}: cannot write the picture ({words})") from error
         finally:
             plotter.close()
     has_trame = importlib.util.find_spec("trame") is not None

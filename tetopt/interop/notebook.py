@@ -1,7 +1,7 @@
-"""What a notebook shows of meshes, images and results: numbers, a small picture, and the progress of a run.
+"""Display of meshes, images and results in notebooks: numbers, a small picture, and the progress of a run.
 
-All of plain arrays, so that any class can use it. Pictures are drawn by Pillow: they take some kilobytes however many
-cells there are.
+Functions take plain arrays, so that any class can use them. Pillow draws the pictures, which take a few kilobytes
+whatever the number of cells.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 
-PICTURE_PIXELS = 320  # the longer side of a picture: beside a table of numbers
-DRAWN_SCALE = 2  # drawn so many times larger, and made smaller: smooth edges
-PICTURE_COLOURS = 32  # in its palette, half of the bytes of 256
+PICTURE_PIXELS = 320  # the longer side of a picture, which stands beside a table of numbers
+DRAWN_SCALE = 2  # pictures are drawn at this scale and reduced, for smooth edges
+PICTURE_COLOURS = 32  # size of the palette: half of the bytes that 256 colours take
 MARGIN_PIXELS = 4  # around the cells
-MANY_SECTIONED = 4000  # cells of a section beyond which their edges would hide them
-# Cells without values; edges that stand out from all greys, on a page in light as in dark.
+MANY_SECTIONED = 4000  # cells in a section beyond which edges would hide them
+# The colour of cells without values, and an edge colour that stands out from all greys on light and dark pages.
 CELL_COLOUR, EDGE_COLOUR = (150, 190, 225, 255), (40, 90, 160, 255)
-DARKEST_GREY, BRIGHTEST_GREY = 30, 245  # of values: neither is the page's black or white
-GREY_QUANTILES = (0.01, 0.99)  # of values, drawn as those two: single cells do not take the contrast away
+DARKEST_GREY, BRIGHTEST_GREY = 30, 245  # range of drawn values, distinct from the page's black and white
+GREY_QUANTILES = (0.01, 0.99)  # quantiles drawn as these two greys, so that single cells do not reduce the contrast
 TABLE_STYLE = "border-collapse:collapse;margin:0;color:inherit"
 CELL_STYLE = "text-align:left;padding:0.15em 0.8em 0.15em 0;vertical-align:top;background:none;color:inherit"
 
 
 def card_html(title: str, rows: Iterable[tuple[str, str]], picture: str = "") -> str:
-    """A title, rows of names and values, and markup of a picture beside them, in the colours of the page.
+    """Return HTML with a title, rows of names and values, and a picture beside them, in the colours of the page.
 
-    Title and rows are texts of any kind, which are escaped.
+    Title and rows may be any text; they are escaped. `picture` is HTML.
     """
     lines = "".join(
         f'<tr><th style="{CELL_STYLE}">{_escaped(name)}</th><td style="{CELL_STYLE}">{_escaped(value)}</td></tr>'
@@ -55,12 +55,12 @@ def card_html(title: str, rows: Iterable[tuple[str, str]], picture: str = "") ->
 
 
 def _escaped(text: str) -> str:
-    """A text on one line, for HTML."""
+    """Escape a text for HTML, on one line."""
     return html.escape("".join(sign if sign.isprintable() else " " for sign in text))
 
 
 def mesh_rows(points: NDArray[np.float64], cells: NDArray[np.int64]) -> list[tuple[str, str]]:
-    """Numbers of a mesh in words: its size, its extent, how its cells are shaped."""
+    """Return rows that describe a mesh: its size, its extent and the shape of its cells."""
     n = points.shape[1]
     shape = rho(points, cells)
     angles = dihedral_angles(points, cells)
@@ -74,7 +74,7 @@ def mesh_rows(points: NDArray[np.float64], cells: NDArray[np.int64]) -> list[tup
 
 
 def extent_words(points: NDArray[np.float64]) -> str:
-    """The sides of the box around points, mm."""
+    """Format the sides of the bounding box of points, mm."""
     return f"{' x '.join(f'{side:.4g}' for side in np.ptp(points, axis=0))} mm"
 
 
@@ -82,9 +82,9 @@ def extent_words(points: NDArray[np.float64]) -> str:
 
 
 def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: NDArray | None = None) -> str:
-    """A picture of a mesh: in 3-D the cells that the middle plane across z cuts, x to the right and y upwards.
+    """Return a picture of a mesh as HTML: in 3-D its section at half height in z, x to the right and y upwards.
 
-    With a number for each cell, (M,), cells are grey by it, else all have one colour.
+    With one value per cell, (M,), cells are shaded by it; otherwise all have one colour.
     """
     values = None if values is None or values.shape != (len(cells),) else values.astype(np.float64)
     if points.shape[1] == 3:
@@ -93,13 +93,13 @@ def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: 
         corners, owner, where = cut.corners[:, :, :2], cut.cells, f"the section at z = {middle:.4g} mm"
     else:
         corners, owner, where = points[cells], np.arange(len(cells)), "the mesh"
-    if len(owner) == 0:  # of pieces on both sides
+    if len(owner) == 0:  # separate components on both sides of the plane
         return ""
     return _picture_html(_drawn(corners, None if values is None else values[owner]), f"{where}: its cells")
 
 
 def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:
-    """Polygons (K, 3 or 4, 2) as a picture, grey by their values (K,)."""
+    """Draw polygons (K, 3 or 4, 2), shaded by their values (K,)."""
     import PIL.Image
     import PIL.ImageDraw
 
@@ -119,7 +119,7 @@ def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Im
 
 
 def greys(values: NDArray) -> NDArray[np.int64]:
-    """Numbers as greys between the darkest and the brightest; NaN is the darkest."""
+    """Map numbers to greys between the darkest and the brightest; NaN becomes the darkest."""
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, GREY_QUANTILES) if finite.size else (0.0, 0.0)
     fraction = np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.full(values.shape, 0.5)
@@ -128,7 +128,7 @@ def greys(values: NDArray) -> NDArray[np.int64]:
 
 
 def slice_html(data: NDArray, affine: NDArray[np.float64]) -> str:
-    """A picture of an image's voxels: in 3-D its middle slice along the last axis, in 2-D all of it."""
+    """Return a picture of an image's voxels as HTML: in 3-D the middle slice along the last axis."""
     import PIL.Image
 
     flat = data[:, :, data.shape[2] // 2] if data.ndim == 3 else data
@@ -144,7 +144,7 @@ def slice_html(data: NDArray, affine: NDArray[np.float64]) -> str:
 
 
 def _picture_html(picture: PIL.Image.Image, words: str) -> str:
-    """A picture of few colours within the page, transparent where nothing is."""
+    """Embed a picture in a page, with few colours and a transparent background."""
     file = io.BytesIO()
     few = picture.quantize(PICTURE_COLOURS) if picture.mode == "RGBA" else picture
     few.save(file, "PNG", optimize=True)
@@ -156,14 +156,14 @@ def _picture_html(picture: PIL.Image.Image, words: str) -> str:
 
 
 def in_kernel() -> bool:
-    """Whether this runs in a notebook: IPython with a kernel, and not in a terminal."""
-    ipython = sys.modules.get("IPython")  # nobody else has loaded it, if it is not there
+    """Return whether this runs in a notebook: IPython with a kernel, not in a terminal."""
+    ipython = sys.modules.get("IPython")  # a notebook has loaded it already
     shell = None if ipython is None else ipython.get_ipython()
     return getattr(shell, "kernel", None) is not None
 
 
 class Bar:
-    """The progress of a run in a notebook, as a callback of records."""
+    """A progress bar for a run in a notebook; a callback that takes records."""
 
     def __init__(self, iterations: int) -> None:
         from IPython.display import display  # type: ignore[import-not-found, unused-ignore]
@@ -172,17 +172,17 @@ class Bar:
         self.handle = display(self._shown("begins"), display_id=True, raw=True)
 
     def __call__(self, record: Any) -> None:
-        """Show a row of the history."""
+        """Show one row of the history."""
         words = f"iteration {record.iteration} of {self.iterations}, E {record.E:.3f}, {record.seconds:.1f} s"
         self._update(words, record.iteration)
 
     def end(self, record: Any, ended: str) -> None:
-        """Show how the run ended, with its last row."""
+        """Show why the run ended, with its last row."""
         words = f"ended after {record.iteration} iterations ({ended}), E {record.E:.3f}, {record.seconds:.1f} s"
         self._update(words, self.iterations)
 
     def _update(self, words: str, iteration: int) -> None:
-        if self.handle is not None:  # where nothing can be displayed
+        if self.handle is not None:  # None where nothing can be displayed
             self.handle.update(self._shown(words, iteration), raw=True)
 
     def _shown(self, words: str, iteration: int = 0) -> dict[str, str]:
@@ -192,9 +192,9 @@ class Bar:
 
 
 def with_bar(function: Callable[..., R]) -> Callable[..., R]:
-    """A function of a `callback` of records that in a notebook, without another callback, shows a bar.
+    """Decorate a function that takes a `callback` so that it shows a progress bar in a notebook by default.
 
-    It takes `iterations` and `callback` by name, and returns what has `history` and `ended`.
+    The function takes `iterations` and `callback` by name, and its result has `history` and `ended`.
     """
     default = inspect.signature(function).parameters["iterations"].default
 

@@ -1,1 +1,1 @@
-"""Files in and out; one module per family of formats."""
+"""Reading and writing files, with one module per family of formats."""

@@ -1,4 +1,4 @@
-"""Abaqus input files, which CalculiX reads, too: mesh, sets, materials and a static step."""
+"""Abaqus input files, which CalculiX also reads: mesh, sets, materials and static steps."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from tetopt.model.model import Model, described, element_facets, elements, mass_
 from tetopt.model.sets import Sets
 from tetopt.system.incoming import regular_file
 
-ALL_ELEMENTS = "all_cells"  # the set that results are asked for
-SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells
-HOTTEST_DEGREES = 1000.0  # for the largest modulus; CalculiX rounds temperatures to some 1e-8 degrees
-# From one temperature to the next, where 1 / modulus is taken for linear in between: off by 5e-5 at most.
+ALL_ELEMENTS = "all_cells"  # the set for which results are requested
+SPRING_PREFIX = "spring-"  # of sets of one spring each; springs are elements after the cells
+HOTTEST_DEGREES = 1000.0  # for the largest modulus; CalculiX rounds temperatures to about 1e-8 degrees
+# Between adjacent temperatures, where 1 / modulus is interpolated linearly: an error of at most 5e-5.
 TEMPERATURE_RATIO = 1.02
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
-# Of a number: Abaqus takes no more, and CalculiX reads the first 20, so that 1.234567890123456e-05 becomes 1.23.
+# In a number: Abaqus allows no more, and CalculiX reads only the first 20, so that 1.234567890123456e-05 becomes 1.23.
 NUMBER_CHARACTERS = 20
-COMMENT_CHARACTERS = 120  # of a comment line; Abaqus reads lines of up to 256
+COMMENT_CHARACTERS = 120  # in a comment line; Abaqus reads lines of up to 256
 
-# Requests that both solvers know. CalculiX alone has TOTALS=ONLY, which would leave out the energy of each cell.
+# Requests that both solvers know. Only CalculiX has TOTALS=ONLY, which would omit the energy of each cell.
 OUTPUT_REQUESTS = f"""\
 ** Displacement, stress and strain (CalculiX .frd, Abaqus .fil)
 *NODE FILE
@@ -45,27 +45,27 @@ ELSE
 
 
 def abaqus(model: Model) -> bytes:
-    """The bytes of an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
+    """Return an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
 
-    Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
-    with midside nodes if there are; each cell set is an element set. "all_cells" are all elements. Materials, and the
-    element set of each, are called as their labels are (`tetopt.io.tags.named_materials`). A modulus that varies within
-    cells is a material whose modulus depends on the temperature: at each node the temperature is the modulus, as
-    thousandths of the largest; both solvers take it linearly from the corners, and nothing expands.
+    Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set becomes a surface and a node set of its name, the
+    latter including midside nodes; each cell set becomes an element set. "all_cells" contains all elements. Materials
+    and their element sets are named after labels (`tetopt.io.tags.named_materials`). A modulus that varies within
+    cells becomes a material with a temperature-dependent modulus: the temperature at each node is the modulus in
+    thousandths of the largest; both solvers interpolate it linearly between corners, and there is no expansion.
 
-    With loads there is a static step for each of theirs, a load case of its own, whose strain energy and reaction
-    forces both solvers print: pressure on faces, tractions as forces at nodes and springs from nodes to the ground
-    by `tetopt.model.loads.facet_weights`, gravity on all cells. A nonlinear model's steps ask for large deformation, of
-    a neo-Hookean material, since the linear law of Green's strain collapses under pressure.
+    Each step of the loads becomes a static step, a separate load case, whose strain energy and reaction forces both
+    solvers print: pressure on faces, tractions as nodal forces and springs from nodes to the ground by
+    `tetopt.model.loads.facet_weights`, and gravity on all cells. Steps of a nonlinear model request large deformation
+    with a neo-Hookean material, because linear elasticity in Green's strain collapses under pressure.
 
-    Numbers read back the same, but for those that take more than 20 characters, which neither solver reads: they are
-    rounded to the 13 to 16 digits that fit. Of coordinates these are some of those within 0.1 mm of 0.
+    Numbers read back unchanged, except those of more than 20 characters, which neither solver reads: they are rounded
+    to the 13 to 16 digits that fit. Among coordinates, this affects some of those within 0.1 mm of 0.
 
     Raises
     ------
     InputError
-        A 2-D model, loads without materials, springs in some of the steps alone, or a set with the name of one of the
-        file's own.
+        The model is 2-D; loads have no materials; springs are in only some steps; a set has a name that the file uses
+        itself.
     """
     if model.materials is not None and model.node_young is not None:
         model = model._replace(materials=without_moduli(model.materials))
@@ -83,18 +83,16 @@ def abaqus(model: Model) -> bytes:
 
 def _check(model: Model) -> None:
     if model.mesh.ndim == 2:
-        raise InputError("abaqus: expected a mesh of tetrahedra, got triangles; .vtu holds them")
+        raise InputError("abaqus: expected a tetrahedral mesh, got triangles; use .vtu")
     if model.loads and model.materials is None:
-        raise InputError(
-            "abaqus: loads, but no materials to press on; give a modulus mapping (`young`) or leave out the loads"
-        )
+        raise InputError("abaqus: loads need materials; give a modulus mapping (`young`) or omit the loads")
     if count_of_steps(model.loads) > 1 and (some := [x for x in model.loads if x.kind == "spring" and x.step]):
         raise InputError(
-            f"abaqus: springs are in every step, got {load_words(some[0])}; leave out the step, or write several files"
+            f"abaqus: expected springs in all steps, got {load_words(some[0])}; omit the step or write several files"
         )
     if model.is_nonlinear and (count := count_of_steps(model.loads)) > 1:
         raise InputError(
-            f"abaqus: expected one nonlinear step, got {count}, each of which would go on from the one before; write a "
+            f"abaqus: expected one nonlinear step, got {count}, and each would continue from the previous one; write a "
             "file for each"
         )
     others = {name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)}
@@ -102,7 +100,7 @@ def _check(model: Model) -> None:
 
 
 def _shared_sets(model: Model) -> set[str]:
-    """The names of materials that are those of sets of the same cells."""
+    """Return the names of materials that equal the name of a set of the same cells."""
     if model.materials is None:
         return set()
     of_material = zip(named_materials(model), cells_of(model.materials), strict=True)
@@ -116,7 +114,7 @@ def _head(model: Model) -> str:
 
 
 def _mesh(model: Model) -> list[str]:
-    """Nodes, node sets and elements."""
+    """Return nodes, node sets and elements."""
     points, cells = elements(model)
     return [
         f"*NODE\n{_numbered(_fitting(points))}",
@@ -147,7 +145,7 @@ def _materials(model: Model) -> list[str]:
 
 
 def _law(model: Model, materials: Materials, k: int) -> str:
-    """The elastic law of a material, at each of some temperatures if it depends on them."""
+    """Return the elastic constants of a material, at several temperatures if it depends on them."""
     nu = float(materials.nu[k])
     if model.node_young is None:
         young = materials.young[k : k + 1]
@@ -159,19 +157,19 @@ def _law(model: Model, materials: Materials, k: int) -> str:
     if not model.is_nonlinear:
         constants = (young, np.full(len(young), nu))
         return f"*ELASTIC\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
-    # C10 = mu / 2 and D1 = 2 / bulk modulus, so that small strains find the same law.
+    # C10 = mu / 2 and D1 = 2 / bulk modulus, so that the response at small strains is the same.
     constants = (young / (4.0 + 4.0 * nu), 6.0 * (1.0 - 2.0 * nu) / young)
     return f"*HYPERELASTIC, NEO HOOKE\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
 
 
 def _temperatures(model: Model, young: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The temperatures that stand for moduli."""
+    """Return the temperatures that represent moduli."""
     assert model.node_young is not None
     return young * (HOTTEST_DEGREES / model.node_young.max())
 
 
 def _springs(model: Model) -> list[str]:
-    """Three springs at each node of a sprung set, along the axes, each of its own stiffness."""
+    """Return three springs along the axes at each node of a set with springs."""
     parts, number = [], len(model.mesh.cells)
     for load in model.loads:
         if load.kind != "spring":
@@ -189,9 +187,9 @@ def _springs(model: Model) -> list[str]:
 
 
 def _step(model: Model, step: int) -> list[str]:
-    """A step, which begins by removing what acts in the one before.
+    """Return a step, which first removes the loads of the previous one.
 
-    Loads that add up are added here: solvers differ in what they make of a node or face that is named twice.
+    Loads on the same node or face are added here: solvers treat repeated ones differently.
     """
     loads = in_step(model.loads, step)
     new = ", OP=NEW" if count_of_steps(model.loads) > 1 else ""
@@ -211,7 +209,7 @@ def _step(model: Model, step: int) -> list[str]:
 
 
 def _conditions(loads: tuple[Load, ...]) -> str:
-    """Displacements of sets, by component."""
+    """Return displacements of sets, by component."""
     lines = []
     for load in loads:
         if load.kind == "displacement":
@@ -222,7 +220,7 @@ def _conditions(loads: tuple[Load, ...]) -> str:
 
 
 def _forces(model: Model, loads: tuple[Load, ...]) -> str:
-    """What tractions do to nodes, by component."""
+    """Return nodal forces of tractions, by component."""
     total = np.zeros_like(elements(model)[0])
     for load in loads:
         if load.kind == "traction":
@@ -233,7 +231,7 @@ def _forces(model: Model, loads: tuple[Load, ...]) -> str:
 
 
 def _pressures(model: Model, loads: tuple[Load, ...]) -> str:
-    """Pressures on faces of cells; CalculiX takes no OP=NEW for pressures on surfaces."""
+    """Return pressures on faces of cells; CalculiX does not support OP=NEW for pressures on surfaces."""
     pressed = [load for load in loads if load.kind == "pressure"]
     if not pressed:
         return ""
@@ -246,7 +244,7 @@ def _pressures(model: Model, loads: tuple[Load, ...]) -> str:
 
 
 def _weight(loads: tuple[Load, ...]) -> str:
-    """Gravity on all cells."""
+    """Return gravity on all cells."""
     acceleration = sum((load.numbers for load in loads if load.kind == "gravity"), np.zeros(3))
     size = float(np.linalg.norm(acceleration))
     if size == 0.0:
@@ -271,7 +269,7 @@ def _number(value: float) -> str:
 
 
 def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`values`, each rounded so that it is not longer than `NUMBER_CHARACTERS`."""
+    """Round values so that none is longer than `NUMBER_CHARACTERS`."""
     return np.array([_shortened(x) for x in values.ravel().tolist()]).reshape(values.shape)
 
 
@@ -286,7 +284,7 @@ def _shortened(value: float) -> float:
 
 
 def input_sets(path: Path, mesh: Mesh) -> Sets | None:
-    """The sets of an input file of ours, but for materials and "all_cells"; None of others' files and other meshes."""
+    """Read the sets of an input file of tetopt's, except materials and "all_cells"; None for other files and meshes."""
     text = regular_file(path, "Abaqus file").read_text("utf-8", "replace")
     facets, cells, own = {}, {}, {ALL_ELEMENTS}
     if not text.startswith("** tetopt"):

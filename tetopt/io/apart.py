@@ -1,9 +1,9 @@
-"""An untrusted file read in a process of its own, by libraries of compiled code that end the process at damaged ones.
+"""Reading untrusted files in a separate process, by compiled libraries that damaged files can crash.
 
-The child is ``python -P -m tetopt.io.apart``: job by standard input, arrays by standard output, as a line of JSON and
-then their bytes, so that nothing of it is executed here (no pickle). Its memory is limited (RLIMIT_AS), so that what a
-header announces is refused instead of allocated, and so is its time. It costs a third of a second, most of it for
-loading the library, which the parent then need not load.
+The child is ``python -P -m tetopt.io.apart``: it gets its job by standard input and returns arrays by standard output,
+as a line of JSON and their bytes, so that nothing is executed here (no pickle). Its memory is limited (RLIMIT_AS), so
+that excessive sizes in a header are refused and not allocated; its time is limited, too. It costs a third of a second,
+most of it for loading the library, which the parent then need not load.
 """
 
 from __future__ import annotations
@@ -30,40 +30,40 @@ from tetopt.system.budget import address_bytes
 from tetopt.system.child import limit_self, signal_words, started
 from tetopt.system.interpreter import python_command, python_environment
 
-LEAST_BYTES = 2**31  # of memory for any file, libraries loaded: their buffers and the largest small file
-BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfold, zlib on meshes tenfold
-BYTES_A_VALUE_BYTE = 4  # of memory for each that the voxels take by the header: the library's copy, numpy's, turned
+LEAST_BYTES = 2**31  # of memory for any file, after loading libraries: their buffers and small files
+BYTES_A_BYTE = 64  # of additional memory per byte of the file: text grows eightfold, zlib on meshes tenfold
+BYTES_A_VALUE_BYTE = 4  # of memory per byte of voxels by the header: copies of the library, numpy and reordering
 LEAST_SECONDS = 60.0  # for any file, also on a busy machine
-SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of what the slowest of these files are read at
-ARRAY_MARK = "\0array"  # which no file has for a name
-DEFLATE_RATIO = 1032  # of a byte of zlib's: it packs no tighter; a header that tells of more is wrong
+SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of the speed for the slowest of these files
+ARRAY_MARK = "\0array"  # a name that no file contains
+DEFLATE_RATIO = 1032  # zlib's maximum compression: a header that announces more is wrong
 
 
 def read_apart(
     read: Callable[..., Any], path: Path, *rest: Any, size: int | None = None, value_bytes: int = 0, library: str
 ) -> Any:
-    """``read(str(path), *rest)``, done in a child process.
+    """Call ``read(str(path), *rest)`` in a child process.
 
     Parameters
     ----------
     read : function
-        Of a module. Gives numbers, texts, None, arrays of numbers or texts, and lists, tuples and dicts of them; lists
-        come back for tuples.
+        A function of a module. Returns numbers, texts, None, arrays of numbers or texts, and lists, tuples and dicts of
+        these; tuples come back as lists.
     path : Path
-        The file, or folder.
+        The file or folder.
     *rest
-        What JSON can tell.
+        Values that JSON supports.
     size : int, optional
-        Bytes to read, by which memory and time are limited; the file's by default.
+        Number of bytes to read, which determines the limits on memory and time; by default that of the file.
     value_bytes : int
-        What the values take by the header, checked by the caller, if it tells.
+        Size of the values by the header, checked by the caller, if known.
     library : str
-        Which one reads it, for the message.
+        Name of the library that reads it, for the message.
 
     Raises
     ------
     InputError
-        That of `read`; or the child has crashed, passed a limit, or raised anything else.
+        `read` raised it; or the child crashed, exceeded a limit, or raised another error.
     """
     size = path.stat().st_size if size is None else size
     most_bytes = LEAST_BYTES + BYTES_A_BYTE * size + BYTES_A_VALUE_BYTE * value_bytes
@@ -84,17 +84,17 @@ def read_apart(
         timer.start()
         with contextlib.closing(child.stdout), contextlib.ExitStack() as stack:
             stack.callback(timer.cancel)
-            with contextlib.suppress(BrokenPipeError):  # it ended before; its exit code says how
+            with contextlib.suppress(BrokenPipeError):  # it ended early; its exit code tells why
                 child.stdin.write(json.dumps(job).encode())
                 child.stdin.close()
             answer = _received(child.stdout)
             code = child.wait()
     if answer is None:
         if time.monotonic() >= deadline or code == -getattr(signal, "SIGXCPU", 0):
-            raise InputError(f"was not read within {seconds:.0f} s by {library}; damaged, or made to take for ever")
+            raise InputError(f"{library} did not read it within {seconds:.0f} s; it may be damaged or malicious")
         ending = (signal_words(code) or f"exit code {code}").rpartition(", ")[2]
         raise InputError(
-            f"{library} crashed at this file ({ending}; it may take {most_bytes / 1e9:.1f} GB); "
+            f"{library} crashed on this file ({ending}; memory limit {most_bytes / 1e9:.1f} GB); "
             "the file is damaged: copy or export it again"
         )
     if "refused" in answer:
@@ -102,7 +102,7 @@ def read_apart(
     return answer["value"]
 
 
-# The way back: one line of JSON, behind it the arrays that it has marks for, in their order.
+# The answer: one line of JSON, followed by the arrays that it has marks for, in order.
 
 
 def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
@@ -123,7 +123,7 @@ def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
 
 
 def _received(stream: IO[bytes]) -> dict[str, Any] | None:
-    """What the child sent; None if it did not come to its end."""
+    """Return the child's answer; None if it is incomplete."""
     line, pipe = stream.readline(), SimpleNamespace(read=stream.read)
 
     def unmarked(table: dict[str, Any]) -> Any:
@@ -143,29 +143,29 @@ def _received(stream: IO[bytes]) -> dict[str, Any] | None:
 
 
 def main() -> None:
-    """Do the job of standard input."""
+    """Do the job given by standard input."""
     stream = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)  # libraries write there what they please
+    os.dup2(nowhere, 1)  # libraries may write anything there
     job = json.loads(sys.stdin.buffer.read())
     module, _, name = job["read"].partition(":")
     try:
         read = getattr(importlib.import_module(module), name)
         limit_self("RLIMIT_AS", address_bytes() + job["bytes"])
         limit_self("RLIMIT_CPU", job["seconds"])
-        limit_self("RLIMIT_CORE", 0)  # no core file of somebody's scan in the folder
+        limit_self("RLIMIT_CORE", 0)  # no core file with a patient's scan
         answer = {"value": read(job["path"], *job["rest"])}
     except InputError as error:
         answer = {"refused": str(error)}
     except MemoryError:
-        answer = {"refused": f"needs more than {job['bytes'] / 1e9:.1f} GB of memory to be read; damaged?"}
-    except Exception as error:  # whatever a library raises at a damaged file
+        answer = {"refused": f"reading it needs more than {job['bytes'] / 1e9:.1f} GB of memory; is it damaged?"}
+    except Exception as error:  # libraries raise any error on damaged files
         words = " ".join(str(error).split())
         answer = {"refused": f"truncated or damaged; copy it again ({type(error).__name__}: {words[:200]})"}
-    with contextlib.suppress(BrokenPipeError):  # the parent has gone
+    with contextlib.suppress(BrokenPipeError):  # the parent has ended
         _sent(stream, answer)
         stream.close()
-    os._exit(0)  # a library whose memory the file has damaged need not tidy up
+    os._exit(0)  # skips the clean-up of a library whose memory the file may have damaged
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """FEBio input files, febio_spec 4.0: mesh, sets, materials, cell data and a static step.
 
-Written from the sources and manuals of FEBio 4 and FEBio Studio 2 and read back with pyfebio; no FEBio has run one of
-them here.
+Based on the sources and manuals of FEBio 4 and FEBio Studio 2, and read back with pyfebio; not yet verified in FEBio.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ from tetopt.model.loads import Load, count_of_steps, facet_forces, spring_consta
 from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
 
-MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is no use
-STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
-# A set's name has no spaces, so that neither these nor the names of parts ("cells of liver") are ever a set's.
+MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is unusable
+STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's names of consistent systems of units
+# Names of sets have no spaces, so that these names, and those of parts ("cells of liver"), never clash with them.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
-YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named as the parameters they stand for
-DEAD_FORCES = "dead forces"  # the set of the nodes that tractions and weight act on, and the map of their forces
+YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named after their parameters
+DEAD_FORCES = "dead forces"  # the set of nodes with forces from tractions and weight, and the map of these forces
 GROUND_NODES = "ground nodes"  # the far ends of springs
-# Springs of FEBio act along their length, so that three stand for one that is the same in all directions: so many times
-# the size of the mesh long, what moves across one stretches it by next to nothing.
+# FEBio's springs act along their length, so that three of them represent one isotropic spring. With this length, in
+# sizes of the mesh, transverse movement hardly stretches them.
 SPRING_LENGTHS = 1000.0
 
-# What FEBio Studio writes, too, but for the equal steps up to the whole displacement, which the solver may halve.
+# The settings of FEBio Studio, except for equal increments up to the whole displacement, which the solver may halve.
 CONTROL_SECTION = """\
 <Control>
 <analysis>STATIC</analysis>
@@ -62,39 +61,38 @@ PLOT_VARIABLES = ("displacement", "stress", "Lagrange strain", "strain energy de
 
 
 class _Part(NamedTuple):
-    """Cells that are of one material."""
+    """Cells of one material."""
 
     name: str
     material: str  # its name
-    young: str  # a number, or the name of a map of it
+    young: str  # a number, or the name of a map
     nu: str
     density: str
     cells: NDArray[np.int64]
 
 
 def febio(model: Model) -> bytes:
-    """The bytes of an FEBio input file (.feb), febio_spec 4.0.
+    """Return an FEBio input file (.feb), febio_spec 4.0.
 
-    Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
-    with midside nodes if there are; each cell set is an element set. A cell's id is its number in the mesh plus 1.
+    Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set becomes a surface and a node set of its name, the
+    latter including midside nodes; each cell set becomes an element set. A cell's id is its number in the mesh plus 1.
 
-    Up to 100 materials are parts of their own, called as their labels are (`tetopt.io.tags.named_materials`): material
-    "liver", part "cells of liver". Their cells come one part after the other. More are
-    one part, "all cells", with E, and v where it varies, mapped by element data. Cell data are element data, too, for
-    FEBio Studio to show or parameters to be mapped from.
+    Up to 100 materials become separate parts, named after their labels (`tetopt.io.tags.named_materials`): material
+    "liver", part "cells of liver". Cells are written part by part. More materials become a single part, "all cells",
+    with E, and v if it varies, mapped by element data. Cell data are written as element data, too, to be shown in FEBio
+    Studio or mapped to parameters.
 
-    The material is neo-Hookean: at small strains it is linear elasticity of these moduli, as `tetopt fem` solves it,
-    and it withstands large compression, where FEBio's "isotropic elastic" (St. Venant-Kirchhoff) softens until cells
-    collapse. With loads there is a static step of ten increments from 0 to the whole of them, of large deformation.
-    Pressures follow their surfaces; tractions and weight are forces on nodes by `tetopt.model.loads.facet_weights` and
-    of a direction that stays; what surrounds a set are three long springs at each of its nodes. It plots the density
-    of the strain energy, whose integral over the undeformed volume is the total. Without loads, the step is left to
-    FEBio Studio.
+    The material is neo-Hookean: at small strains it equals linear elasticity with these moduli, as solved by `tetopt
+    fem`, and it withstands large compression, where FEBio's "isotropic elastic" (St. Venant-Kirchhoff) softens until
+    cells collapse. Loads are applied in a static step of ten increments with large deformation. Pressures follow their
+    surfaces; tractions and weight are nodal forces by `tetopt.model.loads.facet_weights`, with constant direction; the
+    springs of a set are three long springs at each of its nodes. The plot file includes the strain energy density,
+    whose integral over the undeformed volume is the total. Without loads there is no step; add one in FEBio Studio.
 
     Raises
     ------
     InputError
-        A 2-D model, no materials, several steps, or cell data named like the map of a modulus.
+        The model is 2-D, has no materials or several steps, or has cell data with the name of a map.
     """
     _check(model)
     parts = _parts(model)
@@ -118,13 +116,13 @@ def febio(model: Model) -> bytes:
 
 def _check(model: Model) -> None:
     if model.mesh.ndim == 2:
-        raise InputError("febio: expected a mesh of tetrahedra, got triangles; .vtu holds them")
+        raise InputError("febio: expected a tetrahedral mesh, got triangles; use .vtu")
     if model.materials is None:
         raise InputError("febio: a part needs a material; give a modulus mapping (`young`)")
     if taken := {YOUNG_MAP, NU_MAP, DENSITY_MAP, DEAD_FORCES} & model.cell_data.keys():
-        raise InputError(f'febio: a map that the file needs is called "{min(taken)}"; call the cell data otherwise')
-    if (count := count_of_steps(model.loads)) > 1:  # each would go on from the one before
-        raise InputError(f"febio: a file is one step, got {count}; write one for each, with its loads alone")
+        raise InputError(f'febio: the file needs the name "{min(taken)}" for a map; rename the cell data')
+    if (count := count_of_steps(model.loads)) > 1:  # each would continue from the previous one
+        raise InputError(f"febio: expected one step, got {count}; write a file for each step with only its loads")
 
 
 def _parts(model: Model) -> list[_Part]:
@@ -195,9 +193,9 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
 
 
 def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
-    """Element data of each part, joined by their name when read: `lid` counts in the order of the part's cells.
+    """Return element data by part, which FEBio joins by name: `lid` follows the order of the part's cells.
 
-    A set of all cells would not do: FEBio takes one across parts in their order, and not in the set's.
+    A set of all cells would not work: across parts, FEBio uses their order and not that of the set.
     """
     fields: dict[str, NDArray[np.float64]] = {}
     for name, values in model.cell_data.items():
@@ -251,7 +249,7 @@ def _loads(model: Model) -> list[str]:
 
 
 def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Nodes and what tractions and weight do to them, (P, 3)."""
+    """Return the nodes with forces from tractions and weight, and these forces, (P, 3)."""
     total = np.zeros_like(elements(model)[0])
     for load in model.loads:
         if load.kind == "traction":
@@ -259,7 +257,7 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             total[nodes] += forces
         elif load.kind == "gravity" and (table := model.materials) is not None:
             density = density_of(table)[table.of_cell]
-            from tetopt.fem.solution import weight_forces  # scipy's solvers come with it
+            from tetopt.fem.solution import weight_forces  # imported here, as it loads scipy's solvers
 
             total += weight_forces(model.mesh, density, load.numbers, model.order) / STRESS_UNITS[model.units].kPa
     nodes = np.flatnonzero(total.any(axis=1))
@@ -267,7 +265,7 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Nodes on springs, and how stiff these are, (P,)."""
+    """Return the nodes on springs, and their stiffness, (P,)."""
     total = np.zeros(len(elements(model)[0]))
     for load in model.loads:
         if load.kind == "spring":
@@ -278,7 +276,7 @@ def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _ground(model: Model, points: NDArray[np.float64]) -> list[str]:
-    """The far ends of the springs, numbered behind the nodes: along x, y and z from each node on springs."""
+    """Return the far ends of springs, numbered after the nodes: along x, y and z from each node on springs."""
     nodes = _springs(model)[0]
     if len(nodes) == 0:
         return []
@@ -302,7 +300,7 @@ def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[st
 
 
 def _discrete(constants: NDArray[np.float64]) -> list[str]:
-    """A material for each node on springs, and then which springs are of it."""
+    """Return a material for each node on springs, and the assignment of springs to materials."""
     materials = [
         f'<discrete_material id="{k}" name="spring {k}" type="linear spring">\n<E>{constant!r}</E>\n'
         "</discrete_material>\n"
@@ -326,7 +324,7 @@ def _condition(load: Load) -> str:
 
 
 def _items(tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, number: str = "id") -> str:
-    """A line for each row of an array, numbered from 1 or by `ids`."""
+    """Return a line for each row of an array, numbered from 1 or by `ids`."""
     lines = rows(array, separator=",").splitlines()
     numbers = range(1, len(lines) + 1) if ids is None else ids.tolist()
     return "".join(f'<{tag} {number}="{k}">{line}</{tag}>\n' for k, line in zip(numbers, lines, strict=True))

@@ -1,4 +1,4 @@
-"""Every format that a model can be written in, by the suffix of the file."""
+"""The formats of model files, by suffix."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
 class Format(NamedTuple):
-    """What a suffix stands for."""
+    """The format of a suffix."""
 
     what: str
     write: Callable[[Model], bytes | str]
     has_quadratic: bool = False
-    runs: bool = False  # whether loads become a step that the solver runs; else they are words in the file
-    is_surface: bool = False  # holds the boundary alone
-    has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
-    has_large: bool = False  # whether a step can ask for large deformation
+    runs: bool = False  # whether loads become a step that the solver runs; otherwise they are only text in the file
+    is_surface: bool = False  # contains only the boundary
+    has_node_moduli: bool = False  # otherwise a modulus that varies within cells is averaged over each
+    has_large: bool = False  # whether a step can request large deformation
 
 
 FORMATS = {
@@ -52,7 +52,7 @@ FORMATS = {
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
-# How formats whose readers take names of data of `MOST_NAME_CHARACTERS` show them.
+# How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
 SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
 
 
@@ -63,33 +63,33 @@ def register_format(
     suffix: str, write: Callable[[Model], bytes | str], what: str = "another format", *, has_quadratic: bool = False,
     runs: bool = False, has_node_moduli: bool = False, has_large: bool = False,
 ) -> None:  # fmt: skip
-    """Add a format that models are written in, for this process: by `save_model`, `run` and the command alike.
+    """Register a format for writing models in this process, for `save_model`, `run` and the command.
 
     Parameters
     ----------
     suffix : str
-        Of its files, such as ".scn"; lower and upper case are the same.
+        Suffix of its files, such as ".scn"; case is ignored.
     write : callable
-        From a `Model` in the units and axes of the file to what is in it; text is encoded as UTF-8.
+        Converts a `Model`, in the units and axes of the file, to its content; text is encoded as UTF-8.
     what : str
-        What the format is, for messages.
+        Name of the format, for messages.
     has_quadratic : bool
-        Whether it takes models of order 2; else they are refused, or written with linear cells.
+        True if it supports models of order 2; otherwise they are refused, or written with linear cells.
     runs : bool
-        Whether loads become a step that the solver runs; else the command says that they are words.
+        True if loads become a step that the solver runs; otherwise the command notes that they are only text.
     has_node_moduli : bool
-        Whether it takes moduli that vary within cells; else the command says that each cell has their mean.
+        True if it supports moduli that vary within cells; otherwise the command notes that cells have their mean.
     has_large : bool
-        Whether a step can ask for large deformation.
+        True if a step can request large deformation.
 
     Raises
     ------
     InputError
-        A suffix of another form, or of a format that tetopt has.
+        The suffix has an invalid form, or belongs to a built-in format.
 
     See Also
     --------
-    save_model : Writes a model in the format of its file's suffix.
+    save_model : Write a model in the format of its file's suffix.
 
     Examples
     --------
@@ -100,43 +100,43 @@ def register_format(
     if not re.fullmatch(r"\.[a-z0-9_]+", suffix):
         raise InputError(f'suffix: expected a dot, then letters and digits, such as .scn, got "{plain(suffix)}"')
     if suffix in BUILT_IN:
-        raise InputError(f"suffix: tetopt writes {suffix} itself ({FORMATS[suffix].what}); take another")
+        raise InputError(f"suffix: {suffix} is a built-in format ({FORMATS[suffix].what}); choose another suffix")
     FORMATS[suffix] = Format(what, write, has_quadratic, runs, False, has_node_moduli, has_large)
 
 
 def format_of(path: Path) -> Format:
-    """The format that a file's suffix asks for.
+    """Return the format of a file's suffix.
 
     Raises
     ------
     InputError
-        An unknown suffix, with the known ones.
+        The suffix is unknown; the message lists the known ones.
     """
     suffix = path.suffix.lower()
     if suffix == ".pvtu":
-        raise InputError(f"{path}: .pvtu is not written; use .vtkhdf, one file of any size that ParaView reads")
+        raise InputError(f"{path}: cannot write .pvtu; use .vtkhdf, a single file of any size that ParaView reads")
     if suffix not in FORMATS:
         known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
-        raise InputError(f"{path}: unknown suffix; known are {known}")
+        raise InputError(f"{path}: unknown suffix; known suffixes are {known}")
     return FORMATS[suffix]
 
 
 def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str = "kPa") -> None:
     """Write a model in the format of the file's suffix, whole or not at all.
 
-    What was written is compared with what reads back before the file takes its name.
+    The file is read back and compared before it takes its name.
 
-    Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
-    has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
-    become the same are numbered, and a warning tells what changed. Replaces an
-    existing file; ask `tetopt.system.files.checked_output` first.
+    Names of data and of the image are written as `tetopt.io.text.plain` shows them, escaped in XML; gmsh files have
+    apostrophes instead of their quotes, and gmsh, legacy VTK, VTKHDF and FEBio files only their first 240 characters.
+    Names that become equal are numbered, and a warning lists the changes. Replaces an existing file; call
+    `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
     path : str or Path
         Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     model : Model
-        As `build_model` makes it.
+        The result of `build_model`.
     space : {"ras", "lps"}
         Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
     units : {"kPa", "MPa"}
@@ -145,18 +145,18 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Raises
     ------
     InputError
-        An unknown suffix, or what the format cannot carry; sets with names that some format cannot carry.
+        The suffix is unknown; the format does not support the model; names of sets are not supported by all formats.
     OSError
-        As `tetopt.io.readback.save_checked`.
+        For the reasons of `tetopt.io.readback.save_checked`.
 
     Warns
     -----
     UserWarning
-        Data that have other names in the file; linear cells of a Poisson's ratio of 0.45 or more in a solver's file.
+        Data are renamed in the file; a solver's file has linear cells with a Poisson's ratio of 0.45 or more.
 
     See Also
     --------
-    build_model : Makes a model.
+    build_model : Build a model.
 
     Examples
     --------
@@ -184,10 +184,9 @@ def save_mesh(
 ) -> None:
     """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at all.
 
-    Points in world mm (RAS+), cells positively oriented, of order 1 or 2, `cell_data` and `point_data` by name, the
-    latter with a row for each mesh point or for each node of order 2; in VTK's formats each entry of `about` becomes a
-    field-data text, as JSON unless it is a string already. `save_model` writes sets, materials and loads, too. Replaces
-    an existing file; ask `tetopt.system.files.checked_output` first.
+    Points are in world mm (RAS+), cells are positively oriented and of order 1 or 2. In VTK's formats each entry of
+    `about` becomes a field-data text, as JSON unless it is a string already. `save_model` also writes sets, materials
+    and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
@@ -196,23 +195,23 @@ def save_mesh(
     mesh : Mesh
         Points in world mm.
     cell_data : dict of arrays, optional
-        By name, one row a cell.
+        By name, one row per cell.
     about : dict, optional
-        Texts for the file's head, by name.
+        Texts for the file's header, by name.
     point_data : dict of arrays, optional
-        By name, a row for each mesh point, or each node of order 2.
+        By name, one row per mesh point, or per node of order 2.
     order : {1, 2}
-        2: quadratic cells, of straight edges unless the mesh has midpoints.
+        2: quadratic cells, with straight edges unless the mesh has midpoints.
 
     Raises
     ------
     InputError
-        As `save_model`.
+        For the reasons of `save_model`.
 
     See Also
     --------
-    load_mesh : Reads one.
-    save_model : Writes sets, materials and loads, too.
+    load_mesh : Read a mesh.
+    save_model : Also write sets, materials and loads.
 
     Examples
     --------
@@ -228,47 +227,47 @@ def save_mesh(
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
-    """What `save_model` writes.
+    """Return the bytes that `save_model` writes.
 
     Raises
     ------
     InputError
-        As `save_model`.
+        For the reasons of `save_model`.
     """
     whole = format_of(path).write(_ready(path, model, space, units))
     return whole.encode() if isinstance(whole, str) else whole
 
 
 def _ready(path: Path, model: Model, space: str, units: str) -> Model:
-    """The model as it is to be written; InputError for what the format cannot carry."""
+    """Prepare a model for writing; InputError if the format does not support it."""
     kind = format_of(path)
     if model.order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {model.order}")
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
-        raise InputError(f"{path}: only {able} take quadratic cells; leave out `order` 2")
+        raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
     return _named(path, in_units(in_space(model, space), units))
 
 
 def _named(path: Path, model: Model) -> Model:
-    """The model, its data called as the format can hold it, which a warning tells where it changes a name.
+    """Rename data as the format requires; a warning lists the changed names.
 
     Raises
     ------
     InputError
-        Sets with names that not every format can carry, or that differ by case alone.
+        Names of sets are not supported by all formats, or differ only by case.
     """
     sets = [*model.sets.facets, *model.sets.cells]
     if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
         words = f"letters, digits, _ and -, got {plain(odd[0])!r}"
-        raise InputError(f"{path}: the name of a set is a letter, then up to {MOST_LETTERS - 1} {words}")
+        raise InputError(f"{path}: expected set names of a letter and up to {MOST_LETTERS - 1} {words}")
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
-        raise InputError(f"{path}: two sets are called {twice}; call one of them otherwise")
+        raise InputError(f"{path}: two sets have the name {twice}; rename one of them")
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
     names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
     if changed := [new for each in names for old, new in each.items() if old != new]:
-        warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}")
+        warn(f"{path}: renamed data whose names the format does not support: {', '.join(changed)}")
     cell_data, point_data, about = (
         {new[name]: values for name, values in data.items()}
         for new, data in zip(names, (model.cell_data, model.point_data, model.about), strict=True)

@@ -1,8 +1,8 @@
-"""CalculiX's results (.frd) brought back onto the mesh that they are of, read by pyvista-frd-reader.
+"""Import of CalculiX's results (.frd) onto their mesh, read by pyvista-frd-reader.
 
-The reader does not say of which step a result is, gives 0 to nodes that have no line, and reads a file that was cut off
-as far as it goes. Steps, numbers of nodes and the end are therefore taken from the lines around the blocks: "1PSTEP"
-(number, increment, step), "100C" (time, number of nodes) and "9999", which stand there in binary files, too.
+The reader does not tell the step of a result, gives 0 to nodes without a line, and reads truncated files without an
+error. Steps, numbers of nodes and the end are therefore taken from the lines around the blocks: "1PSTEP" (number,
+increment, step), "100C" (time, number of nodes) and "9999", which binary files have, too.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from tetopt.system.incoming import regular_file
 
 # Relative, of a coordinate: half a unit of the sixth digit, which is the last that CalculiX writes, is 5e-6 at most.
 WRITTEN_DIGITS = 6e-6
-HEAD_BYTES = 4096  # The heading of the .inp, which says units and coordinates, is in the second line.
+HEAD_BYTES = 4096  # the second line has the heading of the .inp, with units and coordinates
 LINES_BEFORE = re.compile(
     rb" {4}1PSTEP *\d+ +(\d{1,9}) +(\d{1,9})| {2}100C.{18}(.{12})"
-)  # anywhere: binary blocks end no line
-TENSOR_ROWS = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, zx, row by row
+)  # anywhere: binary blocks do not end with a line break
+TENSOR_ROWS = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # indices into xx, yy, zz, xy, yz, zx, row by row
 
 
-KNOWN_ARRAYS = ("DISP", "TOSTRAIN", "STRESS")  # of the file, by its names
+KNOWN_ARRAYS = ("DISP", "TOSTRAIN", "STRESS")  # the file's names of arrays
 
 
 class Results(NamedTuple):
-    """What a solver found, at the nodes of a mesh.
+    """Solver results at the nodes of a mesh.
 
     Parameters
     ----------
     point_data : dict of arrays
-        By name, a row for each node of the mesh (order 1) or of `tetopt.geometry.quadratic.quadratic` of it (order 2).
+        By name, one row per node of the mesh (order 1) or of its `tetopt.geometry.quadratic.quadratic` (order 2).
         "displacement" (mm), "strain_nodes", "stress_nodes" (9 columns, row by row; kPa) and "von_mises_nodes" (kPa),
-        RAS+; of the second and further steps with "_step2" and so on behind.
+        RAS+; later steps have the suffix "_step2" and so on.
     order : {1, 2}
-        Of the cells.
+        Order of the cells.
     notes : tuple of str
-        What was assumed or left out, a line each.
+        Assumptions and omissions, one line each.
 
     Examples
     --------
@@ -67,37 +67,37 @@ class Results(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """What the file holds."""
+    """The contents of the file."""
 
     points: NDArray[np.float64]  # (N, 3)
     ids: NDArray[np.int64]  # (N,)
     cells: list[NDArray[np.int64]]  # by kind
     n_times: int
-    arrays: list[dict[str, NDArray]]  # of each time that was asked for, by the file's names
+    arrays: list[dict[str, NDArray]]  # for each requested time, by the file's names
 
 
 class _Stage(NamedTuple):
-    """An increment of a step of which there are results, and at how many nodes."""
+    """An increment of a step with results, and their number of nodes."""
 
     step: int
     increment: int
-    n_nodes: int  # the fewest of its results
+    n_nodes: int  # the minimum over its results
 
 
 def read_frd(path: str | Path, mesh: Mesh) -> Results:
-    """The results that CalculiX has written for a mesh, at its nodes, in RAS+, mm and kPa.
+    """Read CalculiX's results for a mesh, at its nodes, in RAS+, mm and kPa.
 
-    Of each step the last increment that there is. Strains and stresses at the nodes are CalculiX's: its mean, over the
-    cells around, of what it carries there from their integration points. Nodes are matched by their numbers, and places
-    and cells are compared. Units and convention of the axes are those that the input file, if tetopt wrote it, says in
-    its head, which CalculiX copies; otherwise kPa, and whichever axes fit.
+    Returns the last increment of each step. Strains and stresses at nodes are CalculiX's: extrapolated from integration
+    points and averaged over the surrounding cells. Nodes are matched by number, and their positions and cells are
+    compared. Units and axes come from the header that tetopt writes to the input file and CalculiX copies; without it,
+    kPa is assumed, and the axes that fit.
 
     Parameters
     ----------
     path : str or Path
         .frd, ASCII or binary.
     mesh : Mesh
-        Tetrahedra: those of the input file, which may be of either order.
+        The tetrahedra of the input file, which may have either order.
 
     Returns
     -------
@@ -107,13 +107,13 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     Raises
     ------
     InputError
-        A file that is missing, not CalculiX's, cut off, or of another mesh; without displacements; with results at some
-        nodes only, or that are no numbers; or pyvista-frd-reader is not installed.
+        The file is missing, not CalculiX's, truncated, or belongs to another mesh; it has no displacements; it has
+        results at only some nodes, or results that are not numbers; pyvista-frd-reader is not installed.
 
     See Also
     --------
-    save_model : Writes the input file.
-    solve : Solves a model without CalculiX.
+    save_model : Write the input file.
+    solve : Solve a model without CalculiX.
 
     Examples
     --------
@@ -139,19 +139,19 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     spaces = re.findall(r"coordinates: (RAS|LPS)\+", head)
     order, space = _checked_mesh(path, mesh, grid, tuple(each.lower() for each in spaces[:1]) or SPACES)
     units = re.findall(rf"units: mm, ({'|'.join(STRESS_UNITS)}),", head)
-    notes = [] if units else [f"{path.name} does not say its units: stresses are taken for kPa"]
+    notes = [] if units else [f"{path.name} does not state its units: assuming kPa for stresses"]
     point_data: dict[str, NDArray[np.float64]] = {}
     for step, number in sorted(of_steps.items()):
         if stages[number].n_nodes != len(grid.points):
             raise InputError(
-                f"{path}: has results at {stages[number].n_nodes} of {len(grid.points)} nodes in step {step}; ask for "
+                f"{path}: has results at {stages[number].n_nodes} of {len(grid.points)} nodes in step {step}; request "
                 "them at all nodes (*NODE FILE and *EL FILE without NSET)"
             )
         suffix = "" if step == 1 else f"_step{step}"
         arrays = _on_mesh(_results_of_step(path, grid.arrays[sorted(of_steps.values()).index(number)], step))
         point_data |= {f"{name}{suffix}": values for name, values in arrays.items()}
         if stages[number].increment > 1:
-            notes.append(f"step {step}: increment {stages[number].increment}, the last that is in the file")
+            notes.append(f"step {step}: increment {stages[number].increment}, the last in the file")
     point_data = stresses_times(STRESS_UNITS[units[0] if units else "kPa"].kPa, point_data)
     return Results(half_turned_fields(point_data) if space == "lps" else point_data, order, tuple(notes))
 
@@ -162,10 +162,10 @@ def _checked_bytes(path: Path) -> bytes:
         if stream.read(6) != b"    1C":
             raise InputError(f"{path}: expected CalculiX's results (.frd), found something else")
     size = path.stat().st_size
-    check_memory(size, f"{path}: its {memory_words(size)} of results", "ask CalculiX for fewer steps or fields")
+    check_memory(size, f"{path}: its {memory_words(size)} of results", "write fewer steps or fields")
     whole = path.read_bytes()
     if not whole.rstrip().endswith(b"9999"):
-        raise InputError(f"{path}: is cut off; is CalculiX still running, or did it break off?")
+        raise InputError(f"{path}: the file is truncated; is CalculiX still running, or did it abort?")
     if importlib.util.find_spec("pyvista_frd") is None:  # an extra: few have CalculiX
         hint = install_hint("calculix", "pyvista-frd-reader")
         raise InputError(f"{path}: reading it needs pyvista-frd-reader; {hint}")
@@ -173,15 +173,15 @@ def _checked_bytes(path: Path) -> bytes:
 
 
 def _grid_of(path: str, numbers: list[int]) -> tuple[Any, ...]:
-    """A `_Grid` of the results at these of its times; in a child, as the reader is compiled code."""
+    """Return a `_Grid` with the results at some times; runs in a child, as the reader is compiled code."""
     import pyvista_frd
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of cells that it does not know; the mesh's are compared
+        warnings.simplefilter("ignore")  # about unknown cells; those of the mesh are compared
         reader = pyvista_frd.FRDReader(path)
     grid, n_times, arrays = reader.read(), reader.number_time_points, []
     for number in numbers:
-        if number < n_times:  # else the times are not the increments, which is told
+        if number < n_times:  # otherwise the times do not match the increments, which is reported
             reader.set_active_time_point(number)
             at = reader.read()
             arrays.append({name: np.asarray(at.point_data[name]) for name in KNOWN_ARRAYS if name in at.point_data})
@@ -191,35 +191,35 @@ def _grid_of(path: str, numbers: list[int]) -> tuple[Any, ...]:
 
 
 def _checked_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) -> tuple[int, str]:
-    """Order of the cells and convention of the axes; InputError if the mesh is another one."""
+    """Return the order of cells and the convention of axes; InputError for another mesh."""
     if mesh.ndim != 3:
-        raise InputError(f"{path}: expected a mesh of tetrahedra beside CalculiX's results, got one of triangles")
+        raise InputError(f"{path}: expected a tetrahedral mesh for CalculiX's results, got triangles")
     nodes_of_order = {1: (mesh.points, mesh.cells), 2: quadratic(mesh.points, mesh.cells, mesh.midpoints)}
     order = next((k for k, (points, _) in nodes_of_order.items() if len(points) == len(grid.points)), None)
     if order is None or sum(map(len, grid.cells)) != len(mesh.cells):
         raise InputError(
-            f"{path}: is of another mesh: expected {len(mesh.cells)} cells and {len(mesh.points)} nodes, or "
-            f"{len(nodes_of_order[2][0])} of quadratic cells; it has {sum(map(len, grid.cells))} and {len(grid.points)}"
+            f"{path}: belongs to another mesh: expected {len(mesh.cells)} cells and {len(mesh.points)} nodes (order 2: "
+            f"{len(nodes_of_order[2][0])}), got {sum(map(len, grid.cells))} cells and {len(grid.points)} nodes"
         )
     points, cells = nodes_of_order[order]
     if not np.array_equal(grid.ids, np.arange(1, len(points) + 1)):
-        raise InputError(f"{path}: is of another mesh: its nodes are not numbered from 1 to {len(points)}")
+        raise InputError(f"{path}: belongs to another mesh: its nodes are not numbered from 1 to {len(points)}")
     distances = {space: np.abs(grid.points - (half_turn(points) if space == "lps" else points)) for space in spaces}
     space = min(spaces, key=lambda each: float(distances[each].max()))
     is_off = (distances[space] > WRITTEN_DIGITS * np.abs(points)).any(axis=1)
     if is_off.any():
         raise InputError(
-            f"{path}: is of another mesh: {int(is_off.sum())} of {len(points)} nodes are elsewhere, by up to "
+            f"{path}: belongs to another mesh: {int(is_off.sum())} of {len(points)} nodes are displaced by up to "
             f"{float(distances[space].max()):.3g} mm"
         )
     theirs = grid.cells[0]
     if theirs.shape != cells.shape or not np.array_equal(np.sort(theirs, axis=1), np.sort(cells, axis=1)):
-        raise InputError(f"{path}: is of another mesh: its nodes are connected otherwise")
+        raise InputError(f"{path}: belongs to another mesh: its nodes are connected differently")
     return order, space
 
 
 def _stages(path: Path, whole: bytes) -> list[_Stage]:
-    """The increments in the order of the reader's times."""
+    """Return the increments in the order of the reader's times."""
     stages: dict[tuple[int, int], int] = {}
     present = (1, 1)
     for match in LINES_BEFORE.finditer(whole):
@@ -229,22 +229,22 @@ def _stages(path: Path, whole: bytes) -> list[_Stage]:
         elif count.strip().isdigit():
             stages[present] = min(int(count), stages.get(present, int(count)))
     if not stages:
-        raise InputError(f"{path}: has no results; did CalculiX break off?")
+        raise InputError(f"{path}: has no results; did CalculiX abort?")
     return [_Stage(*key, count) for key, count in sorted(stages.items())]
 
 
 def _results_of_step(path: Path, arrays: dict[str, NDArray], step: int) -> dict[str, NDArray[np.float64]]:
-    """The file's own arrays of this step that are known here, by its names; InputError unless they are usable."""
+    """Return the file's arrays of this step after checking them; InputError unless they are usable."""
     if "DISP" not in arrays:
-        raise InputError(f"{path}: has no displacements in step {step}; ask for U (*NODE FILE)")
+        raise InputError(f"{path}: has no displacements in step {step}; request U (*NODE FILE)")
     for name, values in arrays.items():
         if not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} of step {step} is not a number at some nodes; the solution broke down")
+            raise InputError(f"{path}: {name} of step {step} is not finite at some nodes; the solution diverged")
     return arrays
 
 
 def _on_mesh(arrays: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """CalculiX's arrays under our names, in the file's axes and units."""
+    """Return CalculiX's arrays under tetopt's names, in the file's axes and units."""
     point_data = {"displacement": arrays["DISP"]}
     if "TOSTRAIN" in arrays:
         point_data["strain_nodes"] = arrays["TOSTRAIN"][:, TENSOR_ROWS]

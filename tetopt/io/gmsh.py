@@ -1,31 +1,31 @@
-"""Meshes for gmsh and all that reads its files: MSH 4.1 and 2.2, as text.
+"""Meshes for gmsh and programs that read its files: MSH 4.1 and 2.2, as text.
 
-Cells: each is in one physical group, as dolfinx wants it. Where cells have labels, the group's number is the label, and
-its name that of the label's set; gmsh has no group 0, so that label 0 has the number after the largest label. Otherwise
-the group is that of its material, "material_1", ..., or without materials that of its cell set, and "unnamed" if it has
-none; a cell set that overlaps one before it, or has the name of a facet set, is no group then (dolfinx and meshio know
-groups by name alone). An entity has the number of its group; only where sets, or in 2.2 materials, divide a group is it
-several entities, numbered behind all groups. The $Comments say which entities make up each set.
+Cells: each cell is in one physical group, as dolfinx requires. If cells have labels, the number of the group is the
+label, and its name is that of the label's set; gmsh has no group 0, so label 0 gets the number after the largest label.
+Otherwise the group is that of its material, "material_1", ..., or without materials that of its cell set, or "unnamed"
+without a set; a cell set that overlaps a previous one, or has the name of a facet set, then has no group (dolfinx and
+meshio know groups only by name). An entity has the number of its group; only if sets, or in 2.2 materials, divide a
+group does it have several entities, numbered after all groups. The $Comments list the entities of each set.
 
-Facets: each is one element, in an entity that belongs to the groups of all of its sets. The numbers of facet groups
-differ from those of the cells' groups. For a given R, those of the box's faces, "mask_surface" and "boundary", up to 2
-R - 1, are the same for every mesh; interfaces and other sets count from R + 1 in their order, so that their numbers
-depend on the sets that the mesh has. R is 1000, or the power of ten that is above all labels. An entity tells the
-smallest set first, which alone meshio has as "gmsh:physical"; in 2.2 an element has one group, so that it is in the
-smallest of its sets: a group such as "boundary" then lacks what is also in a smaller one, and the $Comments tell the
-whole set. dolfinx keeps one group of each facet, that of the smallest number; our XDMF files lose nothing there. A
-facet inside the mesh that two sets hold from opposite sides is turned as in the first of them. The nodes of a group are
-those of its elements.
+Facets: each facet is one element, in an entity that belongs to the groups of all of its sets. The numbers of facet
+groups differ from those of cell groups. For a given R, those of the box's faces, "mask_surface" and "boundary", up to
+2 R - 1, are the same for every mesh; interfaces and other sets are numbered from R + 1 in order, so that their numbers
+depend on the sets of the mesh. R is 1000, or a power of ten above all labels. An entity lists the smallest set first,
+the only one that meshio shows as "gmsh:physical". In 2.2 an element has only one group, that of its smallest set: a
+group such as "boundary" then lacks facets that are also in a smaller set, and the $Comments describe the whole set.
+dolfinx keeps one group of each facet, that with the smallest number; the XDMF files lose nothing there. A facet inside
+the mesh that two sets hold from opposite sides is oriented as in the first of them. The nodes of a group are those of
+its elements.
 
-Views ($ElementData), in 4.1 only, as meshio 5.3.5 reads no 2.2 that has them: the cell data, "young" and "nu" of the
-materials in place of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
-they are held by, since meshio takes no view that leaves elements out. $NodeData are the point data. Of 3 columns either
-is a vector, by which gmsh deforms, of 9 a tensor; data of other numbers of columns are one view a column.
+Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data, "young" and "nu" of
+the materials instead of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
+they belong to, because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns
+are vectors, by which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
 
-More than 1000 materials are no groups, only views; in 2.2 they are refused.
+More than 1000 materials are only views, not groups; in 2.2 they are refused.
 
-The $Comments also tell coordinates, units, each material's constants, and the loads, which MSH has no place for. Our
-own reader goes by them, see `own_comments`.
+The $Comments also contain coordinates, units, each material's constants, and the loads, for which MSH has no place.
+tetopt's own reader uses them, see `own_comments`.
 """
 
 from __future__ import annotations
@@ -55,27 +55,27 @@ from tetopt.model.fields import node_field
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 
-# gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron, and again.
+# gmsh's numbers for elements by dimension and order: line, triangle, tetrahedron of order 1, then of order 2.
 ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
-TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
-VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors and tensors
+TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh lists the midpoint of edge (2, 3) before that of (1, 3)
+VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
-MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
+MOST_MATERIAL_GROUPS = 1000  # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
 
 
 class OwnComments(NamedTuple):
-    """What the comments of a file of ours tell."""
+    """The comments of a file of tetopt's."""
 
     space: str
-    texts: dict[str, str]  # "units", "image", "image_sha256", as far as known
-    constants: dict[str, tuple[float, float]]  # young and nu of each material that is told by entities
-    cells: dict[str, list[int]]  # entities that make up each of these materials and each cell set
-    facets: dict[str, list[int]]  # and each facet set
-    zero: int | None = None  # the group of label 0, where groups are labels
+    texts: dict[str, str]  # "units", "image", "image_sha256", if known
+    constants: dict[str, tuple[float, float]]  # young and nu of each material defined by entities
+    cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
+    facets: dict[str, list[int]]  # entities of each facet set
+    zero: int | None = None  # the group of label 0, if groups are labels
 
 
 def own_comments(lines: list[str]) -> OwnComments | None:
-    """What `gmsh41` and `gmsh22` wrote into the comments; None if others wrote them."""
+    """Parse the comments of `gmsh41` and `gmsh22`; None for those of other programs."""
     coordinates = [line for line in lines if line.startswith("coordinates: ")]
     if not coordinates or not lines[0].startswith("tetopt"):
         return None
@@ -100,28 +100,28 @@ def own_comments(lines: list[str]) -> OwnComments | None:
 
 
 def incomplete_groups(model: Model) -> list[str]:
-    """The facet sets whose group in 2.2 lacks what is in a smaller set, too."""
+    """Return the facet sets whose group in 2.2 lacks facets that are also in a smaller set."""
     _, facets = numbered_parts(model)
     in_several = [groups[1:] for groups in facets.groups_of.values()]
     return [facets.names[number] for number in sorted({each for groups in in_several for each in groups})]
 
 
 def gmsh41(model: Model) -> bytes:
-    """An MSH 4.1 file; see the module for what is where.
+    """Return an MSH 4.1 file; the module describes its layout.
 
-    Elements 1 to M are the cells in their order; they stand entity by entity.
+    Elements 1 to M are the cells in their order; they are written entity by entity.
 
     Raises
     ------
     InputError
-        A set that is called as a group of cells or as cell data are.
+        A set has the name of a group of cells or of cell data.
     """
     grouped, comments = model, []
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
         comments = [f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not groups"]
     labels = group_labels(model)
-    if labels is not None and not _is_of_labels(grouped, labels):  # an entity is a label: the moduli are views
+    if labels is not None and not _is_of_labels(grouped, labels):  # entities are labels, and moduli are views
         grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
     parts = [_by_entity(part) for part in _parts(grouped)]
@@ -153,19 +153,19 @@ def gmsh41(model: Model) -> bytes:
 
 
 def gmsh22(model: Model) -> bytes:
-    """A MSH 2.2 file, without cell data; see the module for what is where.
+    """Return an MSH 2.2 file, without cell data; the module describes its layout.
 
-    Elements 1 to M are the cells, in their order; then come the facets.
+    Elements 1 to M are the cells, in their order; the facets follow.
 
     Raises
     ------
     InputError
-        As `gmsh41`, or more than 1000 materials.
+        For the reasons of `gmsh41`; there are more than 1000 materials.
     """
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         raise InputError(
             f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a group, got "
-            f"{_n_materials(model)}; group them with `bins` 32, or name the file .msh"
+            f"{_n_materials(model)}; group them with `bins` 32, or use .msh"
         )
     points, cells = _geometry(model)
     parts = _parts(model)
@@ -203,28 +203,28 @@ def _section(name: str, *parts: str) -> str:
 
 
 def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (P, 3) and cells, as `elements`."""
+    """Return points (P, 3) and cells, see `elements`."""
     points, cells = elements(model)
     return np.column_stack([points, np.zeros((len(points), 3 - model.mesh.ndim))]), cells
 
 
 def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int64]:
-    """The nodes of each element, from 0, in gmsh's order."""
+    """Return the nodes of each element, from 0, in gmsh's order."""
     if part.rows.ndim == 1:
         return cells[part.rows][:, TET10_ORDER] if cells.shape[1] == 10 else cells[part.rows]
     return element_facets(cells, part.rows)
 
 
-# Which elements there are
+# Elements
 
 
 def _parts(model: Model) -> list[Part]:
-    """The cells and, if there are sets of them, the facets."""
+    """Return the cells and, if they are in sets, the facets."""
     return [part for part in numbered_parts(model) if len(part.numbers)]
 
 
 def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
-    """Whether all cells of a label are of one material."""
+    """Return whether all cells of a label have one material."""
     if model.materials is None:
         return True
     pairs = np.unique(np.column_stack([labels, model.materials.of_cell]), axis=0)
@@ -232,7 +232,7 @@ def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
 
 
 def _entity_comments(model: Model, parts: list[Part]) -> list[str]:
-    """Which entities make up each set, and that groups are labels, if they are."""
+    """Return comments on the entities of each set and, if groups are labels, a comment on that."""
     labels = group_labels(model)
     lines = [] if labels is None else [LABEL_COMMENT.format(group_of_zero(labels))]
     for part, what in zip(parts, ("cells", "facets"), strict=False):
@@ -249,12 +249,12 @@ def _by_entity(part: Part) -> Part:
 
 
 def _starts(part: Part) -> NDArray[np.int64]:
-    """Where each entity starts in a part that is in their order."""
+    """Return the start of each entity in a part sorted by entity."""
     return np.searchsorted(part.entities, list(part.groups_of))
 
 
 def _entity_lines(model: Model, part: Part) -> str:
-    """Number, bounding box, physical groups, and no bounding entities."""
+    """Return lines of number, bounding box, physical groups, and no bounding entities."""
     mesh = model.mesh
     corners = mesh.points[mesh.cells[part.rows] if part.rows.ndim == 1 else facet_triples(mesh.cells, part.rows)]
     boxes = np.zeros((len(part.groups_of), 2, 3))
@@ -277,7 +277,7 @@ def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
 
 
 def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
-    """Number, type, two tags: group, entity; nodes."""
+    """Return lines of number, type, two tags (group, entity) and nodes."""
     kind = np.full(len(part.numbers), ELEMENT_TYPES[part.dim, model.order])
     place = np.searchsorted(list(part.groups_of), part.entities)
     group = np.array([groups[0] for groups in part.groups_of.values()])[place]
@@ -285,7 +285,7 @@ def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
 
 
 def _views(model: Model, parts: list[Part]) -> list[str]:
-    """The $ElementData sections, with the elements in the order of the file: meshio goes by that."""
+    """Return the $ElementData sections, with elements in the order of the file, on which meshio relies."""
     numbers = np.concatenate([part.numbers for part in parts])
     of_cell = np.concatenate([part.rows if part.rows.ndim == 1 else part.rows[:, 0] for part in parts])
     of_cells = [_view("ElementData", name, numbers, values[of_cell]) for name, values in _fields(model).items()]
@@ -300,13 +300,13 @@ def _view(section: str, name: str, numbers: NDArray[np.int64], values: NDArray) 
 
 
 def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
-    """Fields as views hold them: numbers, vectors and tensors; the columns of others one by one."""
-    names = names_apart(fields, lambda name: name.replace('"', "'"))  # which gmsh knows no way to write
+    """Convert fields to views: numbers, vectors and tensors; others column by column."""
+    names = names_apart(fields, lambda name: name.replace('"', "'"))  # gmsh cannot escape quotes
     return as_columns({names[name]: values.astype(np.float64) for name, values in fields.items()}, VIEW_SHAPES)
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
-    """All that there is of each cell, (M,), (M, 3) or (M, 9) float64, by name."""
+    """Return all fields of cells, (M,), (M, 3) or (M, 9) float64, by name."""
     fields = dict(model.cell_data)
     if model.materials is not None:
         of_cell = model.materials.of_cell

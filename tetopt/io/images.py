@@ -1,4 +1,4 @@
-"""Images in: NIfTI, MGZ, NRRD, MetaImage, DICOM and 2-D pictures, each to an `Image` in RAS+ millimetres."""
+"""Reading of images: NIfTI, MGZ, NRRD, MetaImage, DICOM and 2-D pictures, each to an `Image` in RAS+ millimetres."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
 
 Bounds = Sequence[tuple[int | None, int | None]]
-"""One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
+"""One half-open (start, stop) range of voxel indices per axis; None means an open end."""
 
 OUTPUT_SUFFIXES = (".nii", ".nii.gz")
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 
-# What the two libraries raise on damaged files.
+# Errors that the two libraries raise for damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
 _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
-GZIP_LEVEL = 1  # as nibabel packs
-MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
-HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
+GZIP_LEVEL = 1  # nibabel's compression level
+MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
+HEAD_BYTES_NIFTI = 1024  # read from a file: the longest header has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
-MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 where it has no sizes and directions
-# mm along the longest side of an image's box: a body is shorter than the one, micrometres and metres pass as mm beyond.
+MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
+# mm, longest side of an image's box: a body is shorter than the first; beyond these, the unit is probably not mm.
 LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0
-BEGINNING_BYTES = 512  # of a file: web pages begin with their kind, after blanks at most
+BEGINNING_BYTES = 512  # of a file: HTML pages begin with a tag, after at most some blanks
 WEB_BEGINNINGS = (b"<!doctype html", b"<html", b"<head", b"<body")
 GZIP_BEGINNING = b"\x1f\x8b"
-# NIfTI's units of length other than mm.
+# NIfTI's other units of length.
 _MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
 
 
@@ -75,55 +75,55 @@ def load_image(
     slice_: tuple[int, int] | None = None,
     crop: Bounds | None = None,
 ) -> Image:
-    """The image in a file, in a folder of Zarr or of DICOM slices, placed in RAS+ millimetres.
+    """Read an image from a file, or from a folder of Zarr or of DICOM slices, in RAS+ millimetres.
 
-    The suffix, in any case, decides the format: NIfTI and MGZ are read by nibabel; NRRD, MetaImage and DICOM
-    by SimpleITK (the extra ``tetopt[itk]``); 2-D pictures by Pillow; OME-Zarr and arrays of Zarr by zarr (the extra
-    ``tetopt[blocks]``), of which only the part that is asked for is read; `tetopt.io.stored_images.open_stored` tells
-    how they are placed. Axes of length 1 beyond the third are dropped.
+    The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra ``tetopt[itk]``)
+    reads NRRD, MetaImage and DICOM; Pillow reads 2-D pictures; zarr (the extra ``tetopt[blocks]``) reads OME-Zarr and
+    Zarr arrays, and only the requested part; `tetopt.io.stored_images.open_stored` describes their placement. Axes of
+    length 1 beyond the third are dropped.
 
-    NIfTI's scaling, its sform (else qform) and its spatial unit are honoured. ITK's LPS world is turned to
-    RAS. A DICOM series takes its slice axis from the positions of its first and last slice, so a tilted
-    gantry's shear is kept. A picture has 1 mm pixels, index (row, column), world x to the right and y up, and
-    y = 0 at the centres of its bottom row.
+    NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS coordinates are converted to
+    RAS. The slice axis of a DICOM series is determined from the positions of its first and last slice, so that the
+    shear of a tilted gantry is kept. A picture has 1 mm pixels, index (row, column), world x to the right and y up,
+    and y = 0 at the centres of its bottom row.
 
     Parameters
     ----------
     path : str or Path
-        File, or folder of Zarr or with one DICOM series.
+        A file, a Zarr folder, or a folder with one DICOM series.
     volume : int, optional
-        Which volume of a 4-D file or frame of a picture, from 0; it is the only one held in memory. With more
-        than four axes the fourth runs fastest, as in the file; of Zarr's axes that are none of space the last.
+        The volume of a 4-D file or frame of a picture, from 0; only this one is held in memory. With more than four
+        axes the fourth varies fastest, as in the file; for Zarr the last of the non-spatial axes.
     slice_ : (axis, index), optional
-        Take one slice of a 3-D volume as a 2-D image, see `image_slice`.
+        Return one slice of a 3-D volume as a 2-D image, see `image_slice`.
     crop : sequence of (start, stop), optional
-        Keep a box of voxels, see `cropped`; one range for each of the volume's axes.
+        Keep a box of voxels, see `cropped`; one range per axis of the volume.
         Both `slice_` and `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
 
     Returns
     -------
     Image
-        Two-dimensional for a picture, a 2-D file or with `slice_`; else three-dimensional.
+        Two-dimensional for a picture, a 2-D file or with `slice_`; otherwise three-dimensional.
 
     Raises
     ------
     InputError
-        ``"<path>: ..."`` in one line: a file that is missing, unreadable, empty, of unknown kind, truncated
-        or damaged; SimpleITK needed and not installed; a folder without a DICOM series, with several, or with
-        uneven slices; a folder of Zarr that `open_stored` refuses; several volumes and no `volume`, or one out of
-        range; a bad `slice_` or `crop`; RGB, complex, NaN or infinite values; an empty axis; a singular affine.
+        ``"<path>: ..."`` in one line: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
+        SimpleITK is needed and not installed; a folder has no DICOM series, several, or uneven slices; `open_stored`
+        refuses a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
+        invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
 
     Warns
     -----
     UserWarning
         The image is constant, so its discretization error is 0 on every mesh; the file has no orientation; its header
-        was mended; its box is longer than 3 m or shorter than 1 mm, pictures aside; chunks are missing that stand for a
-        value.
+        was repaired; its box is longer than 3 m or shorter than 1 mm, except for pictures; chunks that stand for a
+        value are missing.
 
     See Also
     --------
-    save_image : Writes one.
-    load_label_table : Names and colours of labels.
+    save_image : Write an image.
+    load_label_table : Read names and colours of labels.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def load_image(
             image = part_of(image, slice_, crop)
     except InputError as error:
         raise named_error(path, error) from error
-    if not path.name.lower().endswith(PICTURE_SUFFIXES):  # whose pixels are 1 mm, whatever they show
+    if not path.name.lower().endswith(PICTURE_SUFFIXES):  # pixels of pictures are always 1 mm
         notes += notes_of_size(whole)
     for note in notes:
         warn(f"{path}: {note}")
@@ -160,20 +160,20 @@ def load_image(
 
 
 def named_error(path: Path, error: InputError) -> InputError:
-    """The error in one line that begins with the path, which it may do already."""
+    """Return the error as one line that begins with the path."""
     words = one_line(error)
     return InputError(words if words.startswith(str(path)) else f"{path}: {words}")
 
 
 def file_shape(path: str | Path) -> tuple[int, ...] | None:
-    """Lengths of all axes of the voxels in a file, by its header alone; those of an NRRD file may count components.
+    """Return the lengths of all axes of a file's voxels, from its header; for NRRD they may include components.
 
-    None of a picture or DICOM, which have to be read. Those of Zarr begin with the three in space.
+    Returns None for a picture or DICOM, which would have to be read. For Zarr the three spatial axes come first.
 
     Raises
     ------
     InputError
-        As `load_image`, as far as the header tells.
+        For the reasons of `load_image`, as far as the header shows them.
     """
     path = Path(path)
     name = path.name.lower()
@@ -198,12 +198,12 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
 def save_image(path: str | Path, image: Image) -> None:
     """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm; or OME-Zarr.
 
-    Whole numbers are held as 8- or 16-bit integers where they fit, others as float32 or float64. An axis of more voxels
-    than NIfTI-1 can number makes it a NIfTI-2 file.
+    Whole numbers are stored as 8- or 16-bit integers if they fit, others as float32 or float64. An axis with more
+    voxels than NIfTI-1 supports makes it a NIfTI-2 file.
 
-    A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
-    existing file; ask `tetopt.system.files.checked_output` first. A folder of Zarr (.zarr), of a 3-D image, is
-    `tetopt.io.zarr_images.save_zarr`'s, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
+    A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged. Replaces an existing
+    file; call `tetopt.system.files.checked_output` first. `tetopt.io.zarr_images.save_zarr` writes a Zarr folder
+    (.zarr) of a 3-D image, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
 
     Parameters
     ----------
@@ -215,9 +215,9 @@ def save_image(path: str | Path, image: Image) -> None:
     Raises
     ------
     InputError
-        A name that ends otherwise; as `save_zarr`.
+        The name has another suffix; the reasons of `save_zarr`.
     OSError
-        As `tetopt.io.readback.save_checked`.
+        For the reasons of `tetopt.io.readback.save_checked`.
 
     Examples
     --------
@@ -246,7 +246,7 @@ def save_image(path: str | Path, image: Image) -> None:
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:
-    """Whole numbers of few bits as integers, so that programs take labels for labels; other data as they are."""
+    """Convert small whole numbers to integers, so that programs recognise labels; return other data unchanged."""
     low, high = data.min(), data.max()
     for dtype in (np.uint8, np.int16):
         if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max and np.array_equal(np.rint(data), data):
@@ -255,11 +255,11 @@ def _for_file(data: NDArray[np.floating]) -> NDArray:
 
 
 def image_slice(image: Image, axis: int, index: int) -> Image:
-    """One slice of a 3-D image as a 2-D image, with every length and angle in the slice kept.
+    """Return one slice of a 3-D image as a 2-D image, preserving all lengths and angles in the slice.
 
-    A slice in the plane of two world axes keeps those two of its world coordinates. Else the plane's own frame
-    is Q of the QR factorisation of the affine's two in-plane columns, each axis of Q turned so that its largest
-    component is positive; a voxel's 2-D coordinates are Q^T times its 3-D ones.
+    A slice in the plane of two world axes keeps these two world coordinates. Otherwise the frame of the plane is Q of
+    the QR factorisation of the affine's two in-plane columns, with each axis of Q signed so that its largest component
+    is positive; a voxel's 2-D coordinates are Q^T times its 3-D ones.
 
     Parameters
     ----------
@@ -292,15 +292,15 @@ def image_slice(image: Image, axis: int, index: int) -> Image:
 
 def _check_slice(shape: tuple[int, ...], axis: int, index: int) -> None:
     if len(shape) != 3:
-        raise InputError(f"slice: only a 3-D image has slices, this one is {len(shape)}-D; leave the slice out")
+        raise InputError(f"slice: expected a 3-D image, got a {len(shape)}-D one; omit the slice")
     if axis not in (0, 1, 2):
-        raise InputError(f"slice: the axis must be 0, 1 or 2, got {axis}")
+        raise InputError(f"slice: expected axis 0, 1 or 2, got {axis}")
     if not 0 <= index < shape[axis]:
-        raise InputError(f"slice: index along axis {axis} must be from 0 to {shape[axis] - 1}, got {index}")
+        raise InputError(f"slice: expected an index from 0 to {shape[axis] - 1} along axis {axis}, got {index}")
 
 
 def cropped(image: Image, bounds: Bounds) -> Image:
-    """The voxels inside a box of indices; every voxel keeps its place in the world.
+    """Return the voxels inside a box of indices; every voxel keeps its world position.
 
     Parameters
     ----------
@@ -312,7 +312,7 @@ def cropped(image: Image, bounds: Bounds) -> Image:
     Raises
     ------
     InputError
-        Not n ranges, or a range that is empty or leaves the image.
+        The number of ranges is not n, or a range is empty or leaves the image.
 
     Examples
     --------
@@ -324,12 +324,12 @@ def cropped(image: Image, bounds: Bounds) -> Image:
 
 
 def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
-    """Crop bounds as written on a command line, one start:stop for each axis, for `cropped`.
+    """Parse crop bounds from a command line, one start:stop per axis, for `cropped`.
 
     Raises
     ------
     InputError
-        The text is something else.
+        The text does not have this form.
 
     Examples
     --------
@@ -349,12 +349,12 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
 
 
 def parse_slice(text: str) -> tuple[int, int]:
-    """Array axis (0, 1, 2 or i, j, k) and voxel index as written on a command line, for `image_slice`.
+    """Parse an array axis (0, 1, 2 or i, j, k) and voxel index from a command line, for `image_slice`.
 
     Raises
     ------
     InputError
-        The text is something else.
+        The text does not have this form.
 
     Examples
     --------
@@ -372,15 +372,15 @@ def parse_slice(text: str) -> tuple[int, int]:
 
 
 def sha256(path: str | Path) -> str:
-    """SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
+    """Return the SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
 
-    Of a header whose voxels are in files beside it, with these. Of a folder of Zarr it is that of all files in it and
-    in folders of it, each after its name and its length; `tetopt.io.stored_images.stored_checksum` is the cheap one.
+    For a header with separate data files it includes these. For a Zarr folder it covers all files in it and its
+    subfolders, each after its name and length; `tetopt.io.stored_images.stored_checksum` is a cheaper checksum.
 
     Raises
     ------
     InputError
-        The file or folder is missing, or may not be read.
+        The file or folder is missing or cannot be read.
     """
     path = Path(path)
     digest = hashlib.sha256()
@@ -393,28 +393,28 @@ def sha256(path: str | Path) -> str:
 
 
 def image_files(path: Path) -> list[Path]:
-    """The files that an image is in, other than one of Zarr's: itself, those beside a header, those in a folder.
+    """Return the files of an image other than Zarr: the file itself, data files of a header, or those in a folder.
 
     Raises
     ------
     InputError
-        With the path: something in its place that is neither a regular file nor a folder.
+        With the path: it is neither a regular file nor a folder.
     """
     if (other := irregular(path)) not in (None, "a folder"):
         raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
-    # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
+    # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     if path.name.lower().endswith(HEADED_SUFFIXES):
-        with contextlib.suppress(InputError):  # a header that cannot be read has none
+        with contextlib.suppress(InputError):  # an unreadable header has no data files
             files += data_files(path)
     return files
 
 
 def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
-    """SHA-256 of the relative names and lengths of all files in a folder, in their order, and of what is in them.
+    """Return the SHA-256 of the relative names, lengths and contents of all files in a folder, in order.
 
-    Of those that are not read, by `is_read`, the time of their last change stands for what is in them. Links are
-    followed, to no folder twice.
+    For files that are not read, by `is_read`, the time of their last change replaces their contents. Links are
+    followed, but no folder is visited twice.
     """
     digest, known = hashlib.sha256(), set()
     files: dict[str, Path] = {}
@@ -447,11 +447,11 @@ def _raised(error: OSError) -> None:
     raise error
 
 
-# Choosing the reader
+# Choice of the reader
 
 
 def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
-    """Data and affine of the file, 2-D or 3-D; `Image` checks them. What is to be warned of comes into `notes`."""
+    """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to `notes`."""
     with os_errors_named():
         if path.is_dir():
             return read_dicom_folder(path, volume)
@@ -460,11 +460,11 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
         if name.endswith(suffix):
             return read(path, volume, notes)
     known = ", ".join((*READERS, ZARR_SUFFIX))
-    raise InputError(f"unknown kind of image file; expected {known}, or a folder of DICOM files")
+    raise InputError(f"unknown image format; expected {known}, or a folder of DICOM files")
 
 
 def check_beginning(path: Path) -> str:
-    """The file's name in small letters; InputError where its first bytes already tell that it is no such image."""
+    """Return the file's name in lower case; InputError if its first bytes do not fit the format."""
     with os_errors_named():
         if (other := irregular(path)) is not None:
             raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
@@ -473,17 +473,17 @@ def check_beginning(path: Path) -> str:
     if not beginning:
         raise InputError("the file is empty; copy or export it again")
     if beginning.removeprefix(b"\xef\xbb\xbf").lstrip().lower().startswith(WEB_BEGINNINGS):
-        raise InputError("it begins as a web page, not as an image; download the file itself again")
+        raise InputError("this is an HTML page, not an image; download the file again")
     name = path.name.lower()
     if name.endswith((".nii", ".mgh")) and beginning.startswith(GZIP_BEGINNING):
         ending = ".nii.gz" if name.endswith(".nii") else ".mgz"
-        raise InputError(f"it is a gzip file; name it {path.stem}{ending}")
+        raise InputError(f"this is a gzip file; rename it to {path.stem}{ending}")
     return name
 
 
 @contextlib.contextmanager
 def os_errors_named(path: Path | None = None) -> Iterator[None]:
-    """Turn the operating system's errors into InputErrors, after the file that they tell of, or the path, if given."""
+    """Turn system errors into InputErrors; with `path`, they begin with the file's name or the path."""
     try:
         yield
     except OSError as error:
@@ -491,7 +491,7 @@ def os_errors_named(path: Path | None = None) -> Iterator[None]:
         if isinstance(error, FileNotFoundError):
             words = "no such file or folder; check the path"
         elif isinstance(error, PermissionError):
-            words = "permission denied; make the file readable for your user"
+            words = "permission denied; make the file readable for your account"
         raise InputError(words if path is None else f"{error.filename or path}: {words}") from error
 
 
@@ -512,7 +512,7 @@ def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDA
     return data, affine
 
 
-# By suffix; each gives data and affine of a path and a volume, with notes.
+# By suffix; each returns data and affine for a path and a volume, and adds notes.
 READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArray[np.float64]]]] = {
     **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
     **dict.fromkeys(ITK_READERS, read_itk),
@@ -523,12 +523,12 @@ READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArra
 def nibabel_voxels(
     path: Path, volume: int | None, notes: list[str]
 ) -> tuple[Any, tuple[int, ...], NDArray[np.float64]]:
-    """Nibabel's proxy of the voxels, the index of the volume behind the third axis, and the affine in mm, (4, 4)."""
+    """Return nibabel's proxy of the voxels, the index beyond the third axis, and the affine in mm, (4, 4)."""
     is_packed = path.name.lower().endswith((".gz", ".mgz"))
     head = _checked_head(path, is_packed)
     with _nibabel_heard() as words:
         file = _nibabel_file(path)
-    notes += [f"its header was mended ({word}); check the sizes of its voxels and its place" for word in words]
+    notes += [f"nibabel repaired its header ({word}); check its voxel sizes and position" for word in words]
     notes += _notes_of_place(file, head)
     affine = _affine_in_mm(file)
     index = volume_index(file.shape[3:], volume)
@@ -537,9 +537,9 @@ def nibabel_voxels(
 
 
 def _checked_head(path: Path, is_packed: bool) -> bytes:
-    """The file's first bytes, unpacked; InputError if it is no gzip file, but should be, or has endless extensions.
+    """Return the file's first bytes, unpacked; InputError if it should be a gzip file, or has excessive extensions.
 
-    nibabel reads extensions with the header, whole, before their sizes can be asked for.
+    nibabel reads extensions whole together with the header, before their sizes can be checked.
     """
     try:
         with gzip.open(path) if is_packed else path.open("rb") as stream:
@@ -550,13 +550,13 @@ def _checked_head(path: Path, is_packed: bool) -> bytes:
         if path.name.lower().endswith((".nii", ".nii.gz")) and header.may_contain_header(head):
             offset = float(header(head[: header.sizeof_hdr], check=False)["vox_offset"])
             if not 0.0 <= offset <= EXTENSION_BYTES:
-                raise InputError(f"{DAMAGED_FILE} (its voxels are to begin at byte {offset:g})")
+                raise InputError(f"{DAMAGED_FILE} (its voxels would begin at byte {offset:g})")
     return head
 
 
 @contextlib.contextmanager
 def _nibabel_heard() -> Iterator[list[str]]:
-    """What nibabel logs in this thread, in place of its own lines on the terminal."""
+    """Collect nibabel's log messages of this thread, which are then not printed."""
     words: list[str] = []
     thread = threading.get_ident()
 
@@ -575,11 +575,11 @@ def _nibabel_heard() -> Iterator[list[str]]:
 
 
 def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
-    """What to warn of where the header does not say how the voxels lie, and nibabel guesses."""
+    """Return warnings for a header without orientation, which nibabel guesses."""
     if isinstance(file, nibabel.MGHImage):
         if any(head[MGH_FLAG]):
             return []
-        return ["has no orientation: the sizes of its voxels (1 mm), position and left/right are nibabel's guess"]
+        return ["has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's guess"]
     header: Any = file.header
     if int(header["sform_code"]) or int(header["qform_code"]):
         return []
@@ -588,53 +588,53 @@ def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
 
 
 def notes_of_size(image: Image) -> list[str]:
-    """What to warn of where micrometres or metres were taken for mm."""
+    """Return a warning if the unit is probably not mm."""
     steps = np.linalg.norm(image.affine[:-1, :-1], axis=0)
     longest = float((steps * image.shape).max())
     if SHORTEST_BOX <= longest <= LONGEST_BOX:
         return []
     voxel = " x ".join(f"{step:.4g}" for step in steps)
-    return [f"its box is {longest:.4g} mm along its longest side; are its voxels {voxel} mm, or of another unit?"]
+    return [f"the longest side of its box is {longest:.4g} mm; are its voxels {voxel} mm, or in another unit?"]
 
 
 def _nibabel_file(path: Path) -> SpatialImage:
-    """The file with its header read, of one of the three kinds, as which of many more nibabel might take it."""
-    path = path.absolute()  # nibabel takes a name that begins with ~ for a home
+    """Open a file of one of three formats with its header; nibabel alone would try many more."""
+    path = path.absolute()  # nibabel expands a leading ~ to the home folder
     try:
         if nibabel.Cifti2Image.path_maybe_image(path)[0]:
-            raise InputError("expected an image on a grid of voxels, got a Cifti2Image")
+            raise InputError("expected an image on a voxel grid, got a Cifti2Image")
         for kind in (nibabel.Nifti1Image, nibabel.Nifti2Image, nibabel.MGHImage):
             if kind.path_maybe_image(path)[0]:
                 return kind.from_filename(path)
     except InputError:
         raise
     except FileNotFoundError as error:
-        # The file is there: nibabel looked for another case of its ending.
-        raise InputError("nibabel cannot read an ending in mixed case; rename it to lower case") from error
+        # The file exists: nibabel looked for its suffix in another case.
+        raise InputError("nibabel cannot read a suffix in mixed case; rename it to lower case") from error
     except _NIBABEL_HEADER_ERRORS as error:
         raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
     raise InputError(UNREADABLE_FILE)
 
 
 def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) -> None:
-    """InputError unless the file can hold all volumes up to the one asked for; before any memory is taken for it."""
+    """Raise InputError unless the file can hold all volumes up to the requested one, before memory is allocated."""
     proxy: Any = file.dataobj
     volume_bytes = math.prod(file.shape[:3]) * proxy.dtype.itemsize
     n_bytes, size = proxy.offset + (volume + 1) * volume_bytes, path.stat().st_size
     if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
         raise InputError(
-            f"{DAMAGED_FILE} (its header tells of {' x '.join(str(each) for each in file.shape)} voxels, "
+            f"{DAMAGED_FILE} (its header announces {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, the file has {size})"
         )
     most = proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES
     if is_packed:
         _check_gzip(path, most)
-    elif size > most:  # its checksum would be made of all of it
+    elif size > most:  # its checksum would cover all of it
         raise InputError(TOO_LONG.format(most))
 
 
 def _check_gzip(path: Path, most: int) -> None:
-    """Unpack the whole file once, in blocks: nibabel stops before the checksum behind the last voxel."""
+    """Unpack the whole file once, in blocks: nibabel stops before the checksum after the last voxel."""
     n_bytes = 0
     try:
         with gzip.open(path) as stream:
@@ -648,14 +648,14 @@ def _check_gzip(path: Path, most: int) -> None:
 
 def _of_gzip(error: Exception) -> InputError:
     if "Not a gzipped file" in str(error):
-        return InputError("not a gzip file; if it is not compressed, drop .gz (or z) from its name")
+        return InputError("not a gzip file; if it is not compressed, remove .gz (or z) from its name")
     return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
 
 
 def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
     affine = np.array(file.affine, dtype=np.float64)
     if isinstance(file, nibabel.Nifti1Pair):
-        # A code outside of the standard says nothing: mm, as for 'unknown'.
+        # A code outside the standard means mm, like 'unknown'.
         with contextlib.suppress(KeyError):
             affine[:3] *= _MM_PER_UNIT.get(file.header.get_xyzt_units()[0], 1.0)
     return affine
@@ -665,7 +665,7 @@ def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
 
 
 def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
-    """The crop and then the slice, done in the other order (it is the same) so that indices need no shift."""
+    """Crop and slice an image; slices first, with the same result, so that indices need no shift."""
     if slice_ is None:
         return image if crop is None else cropped(image, crop)
     plane = image_slice(image, *slice_)
@@ -677,7 +677,7 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
 
 
 def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]) -> Image:
-    """The same of an image of Zarr's: only this part of it is read."""
+    """Do the same for a Zarr image, of which only this part is read."""
     bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
     if slice_ is not None:
         axis, index = slice_
@@ -693,11 +693,11 @@ def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds |
 def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:
     start, stop = bounds[axis]
     if not start <= index < stop:
-        raise InputError(f"slice: index {index} along axis {axis} lies outside of the crop {start}:{stop}")
+        raise InputError(f"slice: index {index} along axis {axis} is outside the crop {start}:{stop}")
 
 
 def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
-    """The bounds with their open ends filled in."""
+    """Return the bounds with open ends filled in, after checking them."""
     if len(bounds) != len(shape):
         raise InputError(f"crop: expected {len(shape)} ranges for shape {shape}, got {len(bounds)}")
     ranges = []
@@ -705,17 +705,17 @@ def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, in
         start = 0 if start is None else start
         stop = size if stop is None else stop
         if not 0 <= start < stop <= size:
-            raise InputError(f"crop: along axis {axis} expected 0 <= start < stop <= {size}, got {start}:{stop}")
+            raise InputError(f"crop: expected 0 <= start < stop <= {size} along axis {axis}, got {start}:{stop}")
         ranges.append((start, stop))
     return ranges
 
 
 def _plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """2-D affine (3, 3) of a plane in 3-D: voxel steps `columns` (3, 2) and first voxel `origin` (3,), mm."""
+    """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first voxel `origin`, mm."""
     if not np.isfinite(columns).all():
-        raise InputError(f"affine: every entry must be finite, got {columns.tolist()}")
+        raise InputError(f"affine: expected finite entries, got {columns.tolist()}")
     spanned = np.flatnonzero(columns.any(axis=1))
-    if len(spanned) == 2:  # the plane of two world axes: keep their coordinates
+    if len(spanned) == 2:  # the plane of two world axes keeps their coordinates
         frame = np.eye(3)[:, spanned]
     else:
         frame, _ = np.linalg.qr(columns)

@@ -1,7 +1,7 @@
-"""The headers of NRRD and MetaImage, read here before SimpleITK reads the file: sizes, and which file has the voxels.
+"""Checks of NRRD and MetaImage headers before SimpleITK reads the file: sizes and data files.
 
-ITK takes what they tell: ``NDims = -1`` ends the process, sizes are allocated before the file is found to be too short,
-and a header may name any file of the machine, whose bytes become voxels of the mesh that goes back to its sender.
+ITK trusts headers: ``NDims = -1`` ends the process, memory is allocated before a file is found to be too short, and a
+header may name any file of the machine, whose bytes would become voxels of a mesh that goes back to the sender.
 """
 
 from __future__ import annotations
@@ -16,39 +16,39 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room
 from tetopt.system.incoming import irregular
 
-HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers are read here
-HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
-MOST_AXES = 8  # of a file: more than space, time, and what is measured
+HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # files whose headers are read here
+HEADER_BYTES = 2**20  # at most in a header: 3D Slicer's long ones have 10,000
+MOST_AXES = 8  # more than space, time and components
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
-VALUE_LETTERS = 32  # of text, for a byte of a value at most
-BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
-VALUE_BYTES = {  # of NRRD's words without "unsigned" and the like, and MetaImage's likewise
+VALUE_LETTERS = 32  # letters of text per byte of a value, at most
+BZIP2_RATIO = 50_000  # bzip2 compresses zeros 45,000 times
+VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of MetaImage
     "char": 1, "int8": 1, "int8_t": 1, "short": 2, "short int": 2, "int16": 2, "int16_t": 2, "int": 4, "int32": 4,
     "int32_t": 4, "long": 4, "longlong": 8, "long long": 8, "long long int": 8, "int64": 8, "int64_t": 8, "float": 4,
     "double": 8,
 }  # fmt: skip
-READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompressed .nii, of which parts are read"
+READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompressed .nii, which are read in parts"
 
 
 class VoxelHeader(NamedTuple):
-    """What a header tells."""
+    """The contents of a header."""
 
     sizes: list[int]
     value_bytes: int  # all voxels
-    files: list[str]  # that have the voxels; none if they follow the header
-    ratio: int  # the most that a byte of the file can become
-    skip: str  # bytes before the voxels, as it is written; -1 if the voxels are the last
-    n_bytes: int  # of the header itself, where voxels follow
+    files: list[str]  # data files; empty if the voxels follow the header
+    ratio: int  # maximum expansion of a byte of the file
+    skip: str  # bytes before the voxels, as written; -1 if the voxels are at the end
+    n_bytes: int  # of the header itself, if voxels follow
 
 
 def checked_header(path: Path) -> tuple[int, int]:
-    """Bytes of all files of the image, and of all its voxels.
+    """Return the number of bytes of all files of the image, and of all its voxels.
 
     Raises
     ------
     InputError
-        Without the path before it: a header that cannot be read or tells of more than the files have; a data file that
-        is not beside the header, or no regular file.
+        Without a leading path: the header cannot be read or announces more than the files contain; a data file is not
+        beside the header, or is not a regular file.
     """
     header = _header(path)
     n_bytes = _checked_bytes(path, header)
@@ -57,24 +57,24 @@ def checked_header(path: Path) -> tuple[int, int]:
 
 
 def _checked_bytes(path: Path, header: VoxelHeader) -> int:
-    """Bytes of all files of the image; InputError if its header tells of more, or of far fewer."""
+    """Return the number of bytes of all files of the image; InputError if its header announces more, or far fewer."""
     n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
-            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
+            f"{DAMAGED_FILE} (its header announces {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
     longest = VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
     skipped = int(header.skip) if header.skip.isdecimal() else 0
     most = header.n_bytes + skipped + longest * header.value_bytes + TRAILING_BYTES
-    if n_bytes > most:  # its checksum would be made of all of it
+    if n_bytes > most:  # its checksum would cover all of it
         raise InputError(TOO_LONG.format(most))
     return n_bytes
 
 
 def data_files(path: Path) -> list[Path]:
-    """The files beside a header that have its voxels; InputError as `checked_header`, none where they follow it."""
+    """Return the data files of a header, empty if the voxels follow it; InputError for reasons of `checked_header`."""
     return _data_files(path, _header(path))
 
 
@@ -85,7 +85,7 @@ def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
 
 
 def header_sizes(path: Path) -> tuple[int, ...]:
-    """Lengths of the axes as the header has them; InputError as `checked_header`, as far as the header alone tells."""
+    """Return the lengths of the axes in the header; InputError for the reasons of `checked_header` in the header."""
     return tuple(_header(path).sizes)
 
 
@@ -93,15 +93,15 @@ def _header(path: Path) -> VoxelHeader:
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
     header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
-    if header.files and len(head) == HEADER_BYTES:  # what follows might name others
-        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes, its voxels elsewhere)")
+    if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data files)")
     return header
 
 
 def _check_beside(path: Path, name: str) -> None:
-    """InputError unless the name is that of a regular file in the header's folder."""
+    """Raise InputError unless the name is that of a regular file in the header's folder."""
     if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
-        raise InputError(f'its voxels are in "{name}"; only a file beside the header, by its bare name, is read')
+        raise InputError(f'expected a data file beside the header, given by its bare name, got "{name}"')
     try:
         other = irregular(path.parent / name)
     except OSError as error:
@@ -111,7 +111,7 @@ def _check_beside(path: Path, name: str) -> None:
 
 
 def _sizes(text: str, n_axes: int) -> list[int]:
-    """Lengths of the axes."""
+    """Parse the lengths of the axes."""
     words = text.split()
     if len(words) != n_axes or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
         raise InputError(f"{UNREADABLE_FILE} (expected {n_axes} sizes, got {text[:80]})")
@@ -130,7 +130,7 @@ def _metaimage(head: bytes) -> VoxelHeader:
     lines = head.split(b"\n")
     for number, line in enumerate(lines):
         key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
-        if (key and not equals) or ":" in key:  # which ITK takes for the end of a key, too
+        if (key and not equals) or ":" in key:  # ITK also ends a key at a colon
             raise InputError(UNREADABLE_FILE)
         fields[key] = value
         if key == "ElementDataFile":
@@ -167,7 +167,7 @@ def _nrrd(head: bytes) -> VoxelHeader:
         if not line:
             break
         key, _, value = line.partition(":")
-        if line.startswith("#") or value.startswith("="):  # "key:=value"; of a field's value ":=" is a part
+        if line.startswith("#") or value.startswith("="):  # "key:=value", which is not a field
             continue
         key, value = key.strip().lower(), value.strip()
         fields[key] = value
@@ -191,7 +191,7 @@ def _nrrd(head: bytes) -> VoxelHeader:
 
 
 def _value_bytes(kind: str) -> int:
-    """Bytes of a value of a type."""
+    """Return the number of bytes of a value of a type."""
     name = kind[4:].replace("_", " ").lower() if kind.startswith("MET_") else kind
     name = re.sub("^(unsigned |signed |u)", "", name)
     if name not in VALUE_BYTES:

@@ -1,11 +1,11 @@
-"""Tables of labels' names and colours: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS, or any CSV; told apart by what they hold.
+"""Label tables with names and colours: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS, or any CSV, recognised by content.
 
-- FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue, opacity, in 0 to 255.
+- FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue, opacity, 0 to 255.
 - ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation marks.
-- BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with a first row of names, between tabs, commas or semicolons:
-  columns for the label, the name, and, if there are any, the colour, as "#rrggbb" or as three numbers.
+- BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row, separated by tabs, commas
+  or semicolons: columns for the label, the name, and optionally the colour, as "#rrggbb" or as three numbers.
 
-Lines that are empty, or begin with #, are comments. Opacities are left out.
+Lines that are empty or begin with # are skipped. Opacities are ignored.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
 SNAP_LINE = re.compile(r'\s*(\d{1,9})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*')
 LUT_LINE = re.compile(r"\s*(\d{1,9})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
-# Columns of tables with a first row, in small letters without blanks; the first that there is is taken.
+# Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
 NAME_COLUMNS = ("name", "labelname", "structure", "structures", "region", "type_codemeaning", "label")
 HEX_COLUMNS = ("color", "colour", "hex")
 RGB_COLUMNS = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g", "color_b"))
-NO_NAMES = ("", "(none)", "n/a")  # what stands for none: 3D Slicer's, BIDS'
+NO_NAMES = ("", "(none)", "n/a")  # missing names in 3D Slicer and BIDS
 
 
 class LabelEntry(NamedTuple):
-    """A label as a line of the file has it."""
+    """A label in a line of the file."""
 
     line: int  # from 1
     label: int
@@ -43,10 +43,10 @@ class LabelEntry(NamedTuple):
 
 
 def load_label_table(path: str | Path) -> LabelTable:
-    """Names and colours of labels from a file.
+    """Load names and colours of labels from a file.
 
-    FreeSurfer's and 3D Slicer's tables of colours, ITK-SNAP's descriptions, BIDS's `*_dseg.tsv` and any CSV with a
-    first row of names are told apart by what they hold; `tetopt.io.label_tables` has the columns.
+    Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv` and any CSV with
+    column names in the first row are recognised by their content; `tetopt.io.label_tables` lists the columns.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def load_label_table(path: str | Path) -> LabelTable:
     Raises
     ------
     InputError
-        No such file, one that is not of these kinds, a line that is not like the others, or a label with two names or
-        two colours.
+        The file does not exist or has another format; a line differs from the others; a label has two names or two
+        colours.
 
     Examples
     --------
@@ -77,15 +77,15 @@ def load_label_table(path: str | Path) -> LabelTable:
     lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
     lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
     if not lines:
-        raise InputError(f"{path}: expected a label and its name on each line, found none")
+        raise InputError(f"{path}: expected a label and its name on each line, found no lines")
     table = LabelTable({}, {})
     of_label: dict[int, LabelEntry] = {}
     for entry in _entries(path, lines):
         first = of_label.setdefault(entry.label, entry)
         if first._replace(line=entry.line) != entry:
             raise InputError(
-                f'{path}, line {entry.line}: label {entry.label} is "{entry.name}", but on line {first.line} it is '
-                f'"{first.name}"; give each label once'
+                f'{path}, line {entry.line}: label {entry.label} is "{entry.name}", but "{first.name}" on line '
+                f"{first.line}; list each label only once"
             )
         if entry.name not in NO_NAMES:
             table.names[entry.label] = entry.name
@@ -97,14 +97,12 @@ def load_label_table(path: str | Path) -> LabelTable:
 
 
 def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
-    """The labels of the lines, all of the kind that the first line is of."""
+    """Yield the labels of the lines, all in the format of the first line."""
     first = lines[0][1]
     if SNAP_LINE.fullmatch(first):
-        yield from _matched(
-            path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as ITK-SNAP has it'
-        )
+        yield from _matched(path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP')
     elif LUT_LINE.fullmatch(first):
-        words = "label, name, red, green, blue, opacity, as FreeSurfer and 3D Slicer have it"
+        words = "label, name, red, green, blue, opacity, as in FreeSurfer and 3D Slicer"
         yield from _matched(path, lines, LUT_LINE, words)
     else:
         yield from _of_columns(path, lines)
@@ -120,7 +118,7 @@ def _matched(path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str],
 
 
 def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
-    """The labels of a table with a first row of names."""
+    """Yield the labels of a table with column names in the first row."""
     head = lines[0][1]
     separator = max("\t,;", key=head.count)
     rows = [_cells(path, number, line, separator) for number, line in lines]
@@ -129,12 +127,12 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
     name = next((each for each in NAME_COLUMNS if each in columns and each != label), None)
     if label is None or name is None:
         raise InputError(
-            f"{path}, line {lines[0][0]}: expected a table of labels of FreeSurfer, ITK-SNAP or 3D Slicer, or a row of "
-            f'names with "label" (or "index") and "name", got "{head[:60]}"'
+            f"{path}, line {lines[0][0]}: expected a label table of FreeSurfer, ITK-SNAP or 3D Slicer, or a row of "
+            f'column names with "label" (or "index") and "name", got "{head[:60]}"'
         )
     tones = next((each for each in RGB_COLUMNS if all(part in columns for part in each)), ())
     texts = [row[columns[part]] for row in rows[1:] for part in tones if columns[part] < len(row)]
-    whole = 1.0 if any("." in text for text in texts) else 255.0  # fractions are of 1
+    whole = 1.0 if any("." in text for text in texts) else 255.0  # decimals mean a range of 0 to 1
     code = next((each for each in HEX_COLUMNS if each in columns), None)
     for (number, line), row in zip(lines[1:], rows[1:], strict=True):
         cells = {each: row[k].strip() for each, k in columns.items() if k < len(row)}
@@ -144,7 +142,7 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
             )
         if re.fullmatch(r"\d{1,9}(\.0*)?", cells[label]) is None:
             raise InputError(
-                f'{path}, line {number}: expected a label, a whole number from 0, got "{cells[label]}" under {label}'
+                f'{path}, line {number}: expected a whole number from 0 in column {label}, got "{cells[label]}"'
             )
         colour = None
         if tones and any(cells.get(part, "") not in NO_NAMES for part in tones):
@@ -168,7 +166,7 @@ def _one_line(name: str) -> str:
 
 
 def _colour(path: Path, line: int, texts: list[str] | tuple[str, ...], whole: float) -> tuple[float, float, float]:
-    """A colour of three numbers from 0 to `whole`."""
+    """Parse a colour of three numbers from 0 to `whole`."""
     try:
         red, green, blue = (float(text) / whole for text in texts)
     except ValueError:

@@ -1,10 +1,10 @@
-"""Meshes for medit (INRIA) and what reads its files: FreeFEM, Mmg, SfePy, libMeshb.
+"""Meshes for medit (INRIA) and programs that read its files: FreeFEM, Mmg, SfePy, libMeshb.
 
 A tetrahedron (in 2-D a triangle) has one reference, a number of `tetopt.io.tags.numbered_parts`: its label, or without
-labels its material's number. Where materials or cell sets divide a label, each part has its own. A triangle's (in 2-D
-an edge's) stands in the same way for a combination of facet sets, inside the mesh, too; a facet that two sets hold from
-opposite sides is turned as in the first of them. Comments at the head tell the names that each reference stands for,
-coordinates, units, each material's constants, and the loads. Vertices have the reference 0.
+labels its material's number. If materials or cell sets divide a label, each part has its own reference. Similarly, the
+reference of a triangle (in 2-D an edge) represents a combination of facet sets, also inside the mesh; a facet that two
+sets hold from opposite sides is oriented as in the first of them. Comments in the header list the names of each
+reference, coordinates, units, each material's constants, and the loads. Vertices have the reference 0.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
 
 def medit(model: Model) -> bytes:
-    """A .mesh file in double precision; see the module for what is where.
+    """Return a .mesh file in double precision; the module describes its layout.
 
-    Nodes, elements and their order are those of the mesh. There is no cell data, nor data at the nodes.
+    Nodes, elements and their order are those of the mesh. The file has no cell data or point data.
 
     Raises
     ------
     InputError
-        As `tetopt.io.tags.numbered_parts`.
+        For the reasons of `tetopt.io.tags.numbered_parts`.
     """
     mesh = model.mesh
     points, nodes = elements(model)

@@ -1,4 +1,4 @@
-"""Meshes from files: VTK's formats, and gmsh's MSH."""
+"""Reading of meshes from VTK's formats and gmsh's MSH."""
 
 from __future__ import annotations
 
@@ -25,30 +25,31 @@ from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
-STRAIGHT_FRACTION = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
+STRAIGHT_FRACTION = 1e-6  # of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
 
 
 def load_mesh(path: str | Path) -> MeshFile:
-    """Read triangles or tetrahedra, linear or quadratic, from a file of VTK's or gmsh's.
+    """Read triangles or tetrahedra, linear or quadratic, from a VTK or gmsh file.
 
     Parameters
     ----------
     path : str or Path
-        Its name ends as one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .msh, .msh2.
+        Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .msh, .msh2.
 
     Returns
     -------
     MeshFile
-        The mesh, its data by name, sets, and what was turned or left out.
+        The mesh, its data by name, sets, and notes on reoriented and dropped items.
 
     Raises
     ------
     InputError
-        A missing or unreadable file, no cells, other cell types, triangles out of the plane, flat cells.
+        The file is missing or unreadable; it has no cells, or other cell types; triangles lie outside the plane; cells
+        are flat.
 
     See Also
     --------
-    save_mesh : Writes one.
+    save_mesh : Write a mesh.
 
     Examples
     --------
@@ -61,9 +62,9 @@ def load_mesh(path: str | Path) -> MeshFile:
     """
     path = regular_file(path, "mesh file")
     if path.suffix.lower() == ".pvtu":
-        raise InputError(f"{path}: .pvtu is not read; save the mesh as .vtkhdf or .vtu, as ParaView can")
+        raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtkhdf or .vtu in ParaView")
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: expected a mesh named {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]}")
+        raise InputError(f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh")
     try:
         raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     except InputError as error:
@@ -79,7 +80,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         raise InputError(f"{path}: {error}") from error
     used = picked.used
     sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
-    shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which only tell the sets again
+    shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which repeat the sets
     at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
     of_cells = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
     (cell_data, point_data), notes = _numbers(raw, n, of_cells, at_nodes)
@@ -99,34 +100,34 @@ def load_mesh(path: str | Path) -> MeshFile:
 
 
 def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], bool, tuple[str, ...]]:
-    """The nodes (E,) on the edges of cells of order 2, in the order of `quadratic`, none of order 1; whether one of the
-    edges is curved; and in words how many are, and which middle nodes are left out."""
+    """Return the mid-edge nodes (E,) in the order of `quadratic`, none for order 1; whether any edge is curved; and
+    notes on curved edges and on dropped mid-edge nodes."""
     if kind not in raw.middles:
         return np.empty(0, dtype=np.int64), False, ()
     edges, number = numbered_edges(raw.cells[kind])
     nodes, notes = np.empty(len(edges), dtype=np.int64), []
     nodes[number] = raw.middles[kind]
     if n_torn := len(np.unique(number[nodes[number] != raw.middles[kind]])):
-        notes.append(f"{n_torn} edges have a middle node in each of their cells: one of them is taken")
+        notes.append(f"{n_torn} edges have different mid-edge nodes in their cells: using one of them")
     start, end = np.moveaxis(raw.points[edges], 1, 0)
     off = np.linalg.norm(raw.points[nodes] - 0.5 * (start + end), axis=1)
     straight = STRAIGHT_FRACTION * np.linalg.norm(end - start, axis=1)
-    if (raw.points.astype(np.float32) == raw.points).all():  # a file in single precision, which rounds midpoints
+    if (raw.points.astype(np.float32) == raw.points).all():  # single precision rounds midpoints
         straight += np.finfo(np.float32).eps * np.abs(raw.points).max()
     if n_curved := int((~(off <= straight)).sum()):
-        notes.append(f"{n_curved} of {len(edges)} edges are curved, by up to {off.max():.2g} mm")
+        notes.append(f"{n_curved} of {len(edges)} edges are curved by up to {off.max():.2g} mm")
     return nodes, n_curved > 0, tuple(notes)
 
 
 def _numbers(
     raw: Raw, ndim: int, cell_data: dict[str, NDArray], point_data: dict[str, NDArray]
 ) -> tuple[list[dict[str, NDArray]], tuple[str, ...]]:
-    """Cell data and point data that are numbers, in RAS+ and kPa; and what is left out, in words."""
+    """Return numeric cell data and point data in RAS+ and kPa, and notes on dropped data."""
     fields, notes = [], []
     for what, values_of in (("cell", cell_data), ("point", point_data)):
         numbers = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
         if others := ", ".join(name for name in values_of if name not in numbers):
-            notes.append(f"{what} data left out, as they are no numbers: {others}")
+            notes.append(f"dropped {what} data that are not numbers: {others}")
         fields.append(numbers)
     units = text_in(raw.field_data, "units") or "kPa"
     if units in STRESS_UNITS:
@@ -134,24 +135,24 @@ def _numbers(
     elif lost := [name for each in fields for name in each if is_stress(name)]:
         lost += ["nu", "material", "density"] if "young" in lost else []
         fields = [{name: values for name, values in each.items() if name not in lost} for each in fields]
-        words = f'their unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"'
-        notes.append(f"moduli and stresses left out, as {words}")
+        words = f'unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"'
+        notes.append(f"dropped moduli and stresses, as their {words}")
     if raw.space == "lps" and ndim == 3:
         fields = [half_turned_fields(each) for each in fields]
     return fields, tuple(notes)
 
 
 def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
-    """gmsh's groups of cells and of facets, and notes on those whose names had to change."""
+    """Return gmsh's groups of cells and of facets as sets, and notes on renamed ones."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))
     sets, notes = Sets({}, {}), []
     taken: set[str] = set()
     n = CELL_DIMENSIONS[kind]
     groups = [group for group in raw.groups if n - 1 <= CELL_DIMENSIONS[group.kind] <= n]
-    if "young" in raw.cell_data:  # of which materials are made anew, under the names of these groups
+    if "young" in raw.cell_data:  # materials are rebuilt from it, with the names of these groups
         groups = [group for group in groups if re.fullmatch(r"material_\d+", group.label) is None]
-    # Groups that can keep their names come first, so that they do.
+    # Groups with valid names come first, so that they keep them.
     for group in sorted(groups, key=lambda group: SET_NAME.fullmatch(group.label) is None):
         name = free_name(group.label, taken)
         if group.kind == kind:
@@ -159,12 +160,12 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
         else:
             rows = rows_of(mesh, place[raw.cells[group.kind][group.members]])
             if len(rows) == 0:
-                notes.append(f'"{group.label}" is left out: none of it is a facet of a cell')
+                notes.append(f'dropped group "{group.label}": it contains no facets of cells')
                 continue
             sets.facets[name] = rows
         taken.add(name.lower())
         if name != group.label:
-            notes.append(f'"{group.label}" is the set {name} here')
+            notes.append(f'renamed group "{group.label}" to set {name}')
     return sets, tuple(notes)
 
 
@@ -176,13 +177,13 @@ def _read_vtk(path: Path) -> Raw:
         name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()} for name, values in grid.cell_data.items()
     }
     field_data = {name: _decoded(values) for name, values in grid.field_data.items()}
-    own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # as vtkGhostType
+    own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # e.g. vtkGhostType
     raw = Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data), notes=grid.notes)
     return by_corners(raw)
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:
-    """Whether a file says that its coordinates are LPS: in our words, or in 3D Slicer's."""
+    """Return "lps" if the file states this, as written by tetopt or 3D Slicer, else "ras"."""
     words = " ".join(text_in(field_data, name) or "" for name in ("space", "SPACE"))
     if path.suffix.lower() == ".vtk":
         with path.open("rb") as file:
@@ -192,7 +193,7 @@ def _space(path: Path, field_data: dict[str, NDArray]) -> str:
 
 
 def _decoded(values: NDArray) -> NDArray:
-    """`values`; if they are bytes of UTF-8, as we write texts, that text as an array of one string."""
+    """Decode UTF-8 bytes, as tetopt writes texts, to an array of one string; return other values unchanged."""
     if values.dtype != np.uint8:
         return values
     try:

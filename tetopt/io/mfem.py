@@ -1,17 +1,17 @@
-"""Meshes for MFEM and what is built on it: mesh format v1.3, with named sets of attributes (read by MFEM 4.10).
+"""Meshes for MFEM and programs based on it: mesh format v1.3, with named sets of attributes (read by MFEM 4.10).
 
 An element has one attribute, a number of `tetopt.io.tags.numbered_parts`: its label, or without labels its material's
-number. Where materials or cell sets divide a label, each part has its own. The named sets of the labels, "material_1",
-... and those of the cell sets tell which attributes make them up. A boundary element's attribute stands in the same way
-for a combination of facet sets. Facets inside the mesh that are in a set are boundary elements, too, as MFEM allows;
-one that two sets hold from opposite sides is turned as in the first of them.
+number. If materials or cell sets divide a label, each part has its own attribute. The named sets of the labels,
+"material_1", ... and those of the cell sets list their attributes. Similarly, the attribute of a boundary element
+represents a combination of facet sets. Facets inside the mesh that are in a set are boundary elements, too, as MFEM
+allows; one that two sets hold from opposite sides is oriented as in the first of them.
 
-A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as `Mesh::SetCurvature(2)` makes one: vertices,
-then the middles of edges in the order in which the elements first name them. MFEM takes elements with such a function
-for curved ones, which those on interfaces may be.
+A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as created by `Mesh::SetCurvature(2)`: vertices,
+then the middles of edges in the order of their first occurrence in the elements. MFEM treats elements with such a
+function as curved, as those on interfaces may be.
 
-The comments at the head tell coordinates, units, each material's constants and attributes, and the loads.
-`mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` marks where a condition holds.
+The comments in the header list coordinates, units, each material's constants and attributes, and the loads.
+`mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` returns the marker of a boundary condition.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
 
-ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}  # MFEM's numbers for the simplex of a dimension: segment, triangle, tetrahedron
-# Local corners of an element's edges in the order in which MFEM goes through them (fem/geom.cpp), by dimension.
+ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}  # MFEM's numbers of simplices by dimension: segment, triangle, tetrahedron
+# Local corners of an element's edges in MFEM's order (fem/geom.cpp), by dimension.
 ELEMENT_EDGES = {
     2: np.array([(0, 1), (1, 2), (2, 0)]),
     3: np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]),
@@ -34,14 +34,14 @@ ELEMENT_EDGES = {
 
 
 def mfem(model: Model) -> bytes:
-    """An MFEM mesh file; see the module for what is where.
+    """Return an MFEM mesh file; the module describes its layout.
 
-    Nodes, elements and their order are those of the mesh. There is no cell data, nor data at the nodes.
+    Nodes, elements and their order are those of the mesh. The file has no cell data or point data.
 
     Raises
     ------
     InputError
-        As `tetopt.io.tags.numbered_parts`.
+        For the reasons of `tetopt.io.tags.numbered_parts`.
     """
     mesh = model.mesh
     in_cells, on_facets = numbered_parts(model)
@@ -73,7 +73,7 @@ def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64])
 
 
 def _nodes(mesh: Mesh) -> str:
-    """The function of the nodes of order 2, node by node."""
+    """Return the nodal function of order 2, node by node."""
     ends = np.sort(mesh.cells[:, ELEMENT_EDGES[mesh.ndim]], axis=2).reshape(-1, 2)
     _, first, number = np.unique(ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True, return_inverse=True)
     straight = mesh.points[ends[np.sort(first)]].mean(axis=1)
@@ -83,6 +83,6 @@ def _nodes(mesh: Mesh) -> str:
 
 
 def _sets(tags_of: dict[str, list[int]]) -> str:
-    """How many, then of each the name, how many attributes, and which."""
+    """Return the number of sets, then the name, the number of attributes and the attributes of each."""
     lists = (f'"{name}"\n{len(tags)}\n{blocks(np.array(tags))}' for name, tags in tags_of.items())
     return f"{len(tags_of)}\n" + "".join(lists)

@@ -1,4 +1,4 @@
-"""What a mesh's file holds, before anything of it is checked."""
+"""The contents of a mesh's file before any checks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tetopt.interop.conversions import CELL_DIMENSIONS, corner_kinds
 
 
 class RawGrid(NamedTuple):
-    """An unstructured grid of VTK's as plain arrays."""
+    """A VTK unstructured grid as plain arrays."""
 
     points: NDArray[np.float64]  # (N, 3)
     connectivity: NDArray[np.int64]
@@ -20,11 +20,11 @@ class RawGrid(NamedTuple):
     point_data: dict[str, NDArray]
     cell_data: dict[str, NDArray]
     field_data: dict[str, NDArray]
-    notes: tuple[str, ...] = ()  # what was left out, a line each
+    notes: tuple[str, ...] = ()  # one line for each dropped item
 
 
 class Group(NamedTuple):
-    """Cells of one kind that gmsh's file calls by a name."""
+    """A named group of cells of one type in a gmsh file."""
 
     label: str  # in the file
     kind: str
@@ -33,23 +33,23 @@ class Group(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """A file's cells by kind."""
+    """A file's cells by type."""
 
     points: NDArray[np.float64]  # (N, 3)
     cells: dict[str, NDArray[np.int64]]
-    cell_data: dict[str, dict[str, NDArray]]  # by name, then kind
-    point_data: dict[str, NDArray]  # by name, a row a point
+    cell_data: dict[str, dict[str, NDArray]]  # by name, then type
+    point_data: dict[str, NDArray]  # by name, one row per point
     field_data: dict[str, NDArray]
     groups: list[Group]
     space: str
-    middles: dict[str, NDArray[np.int64]] = {}  # noqa: RUF012 - nobody changes it; see `by_corners`
-    notes: tuple[str, ...] = ()  # what was left out, a line each
+    middles: dict[str, NDArray[np.int64]] = {}  # noqa: RUF012 - never changed; see `by_corners`
+    notes: tuple[str, ...] = ()  # one line for each dropped item
 
 
 def by_corners(raw: Raw) -> Raw:
-    """The cells of order 2 as what they are by their corners; the nodes on their edges are `middles`, by kind.
+    """Rename quadratic cell types to the linear type of their corners; their mid-edge nodes become `middles`, by type.
 
-    Where a kind comes in both orders, that of order 2 keeps its name.
+    If a type occurs in both orders, the quadratic one keeps its name.
     """
     kinds = corner_kinds(raw.cells)
     n_corners = {corner: CELL_DIMENSIONS[corner] + 1 for corner in kinds.values()}

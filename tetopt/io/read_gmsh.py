@@ -1,4 +1,4 @@
-"""gmsh's files as they are read: through meshio, which loses groups that are looked up here."""
+"""Reading of gmsh files through meshio, which loses some groups; these are looked up here."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from tetopt.system.budget import check_memory, memory_words
 if TYPE_CHECKING:
     import meshio
 
-BYTES_A_LETTER = 4  # of memory for each of a gmsh file: its text twice, its numbers
-# What groups without a name are called here, by their dimension; their number follows.
+BYTES_A_LETTER = 4  # of memory per byte of a gmsh file: its text twice, and its numbers
+# Names of unnamed groups, by dimension; their number is appended.
 DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
 
 
 def read_msh(path: Path) -> Raw:
-    """gmsh's file through meshio, in a child with limits: it allocates what a header tells of.
+    """Read a gmsh file through meshio, in a child with limits, as it allocates the sizes in a header.
 
-    InputError, without the path before it, for whatever it stumbles over.
+    All its errors become InputErrors, without a leading path.
     """
     size = path.stat().st_size
     check_memory(BYTES_A_LETTER * size, f"{memory_words(size)} of a gmsh mesh", "save it as .vtu")
@@ -41,19 +41,19 @@ def read_msh(path: Path) -> Raw:
 
 
 def _fields_of(path: str) -> dict[str, Any]:
-    """Those of a `Raw`."""
+    """Return the fields of a `Raw`."""
     import meshio
 
     try:
         file = meshio.gmsh.read(path)
         raw = _msh(file, Path(path).read_bytes())
-    except (Exception, SystemExit) as error:  # meshio raises whatever it stumbles over, and so do damaged sections
+    except (Exception, SystemExit) as error:  # meshio and damaged sections can raise any error
         raise InputError(f"cannot be read as a gmsh mesh ({type(error).__name__})") from error
     return raw._asdict()
 
 
 def _msh(file: meshio.Mesh, text: bytes) -> Raw:
-    """A file as meshio has read it, with its groups, of which meshio loses some."""
+    """Convert a file as read by meshio, and add groups that meshio loses."""
     kinds = list(dict.fromkeys(block.type for block in file.cells))
     of_kind = {kind: [k for k, block in enumerate(file.cells) if block.type == kind] for kind in kinds}
     cells = {
@@ -74,9 +74,9 @@ def _msh(file: meshio.Mesh, text: bytes) -> Raw:
 
 
 def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
-    """The file with the numbers of groups as labels of cells, and their names, if each cell is in one group.
+    """Use the numbers and names of groups as labels of cells, if each cell is in one group.
 
-    Not so if there are other labels already, or groups of a file of ours are no labels.
+    Not done if there are other labels already, or if the groups of a file of tetopt's are not labels.
     """
     kind = _kind_of_cells(raw)
     groups = [group for group in raw.groups if group.kind == kind]
@@ -100,12 +100,12 @@ def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
 
 
 def _kind_of_cells(raw: Raw) -> str:
-    """The kind of largest dimension."""
+    """Return the cell type of highest dimension."""
     return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
 
 
 def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
-    """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
+    """Apply the comments of a file of tetopt's: groups and views become cell sets and materials."""
     kind = _kind_of_cells(raw)
     members = _members(raw, kind, comments.cells)
     constants = np.full((2, len(raw.cells[kind])), np.nan)
@@ -114,7 +114,7 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     is_painted = bool(comments.constants) and np.isfinite(constants).all()
     painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
     sets = [Group(name, kind, of_set) for name, of_set in members.items()]
-    for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in one group alone
+    for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in only one group
         sets += [Group(name, side, of_set) for name, of_set in _members(raw, side, comments.facets).items()]
     labels_of_sets = {each.label for each in sets}
     dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
@@ -127,9 +127,9 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
 
 
 def _members(raw: Raw, kind: str, entities_of: dict[str, list[int]]) -> dict[str, NDArray[np.int64]]:
-    """The elements of a kind in each set, ascending, by the entities that make it up.
+    """Return the elements of a type in each set, ascending, given the entities of the set.
 
-    gmsh keeps our comments and entities when it writes a file again, if not all of their elements.
+    When gmsh saves a file again, it keeps tetopt's comments and entities, but not all of their elements.
     """
     entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
     blocks_of = {name: [entity[each] for each in numbers if each in entity] for name, numbers in entities_of.items()}
@@ -142,7 +142,7 @@ def _groups(
     names: dict[tuple[int, int], str],
     groups_of: dict[tuple[int, int], list[int]] | None,
 ) -> list[Group]:
-    """Physical groups with members, named or not."""
+    """Return physical groups with members, named or unnamed."""
     tags = cell_data.get("gmsh:physical" if groups_of is None else "gmsh:geometrical", {})
     groups = []
     for kind, dim in CELL_DIMENSIONS.items():
@@ -151,8 +151,8 @@ def _groups(
         parts: dict[int, list[NDArray[np.int64]]] = {}
         for value, members in _by_value(tags.get(kind, np.empty(0))).items():
             for group in [value] if groups_of is None else groups_of.get((dim, value), []):
-                parts.setdefault(abs(group), []).append(members)  # a sign tells orientation
-        parts.pop(0, None)  # which stands for no group
+                parts.setdefault(abs(group), []).append(members)  # the sign is an orientation
+        parts.pop(0, None)  # 0 means no group
         for tag, blocks in sorted(parts.items()):
             label = names.get((dim, tag)) or f"{DEFAULT_LABELS[dim]}_{tag}"
             groups.append(Group(label, kind, np.sort(np.concatenate(blocks)), tag))
@@ -160,14 +160,14 @@ def _groups(
 
 
 def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
-    """Where each value stands, ascending."""
+    """Return the positions of each value, ascending."""
     order = np.argsort(tags, kind="stable")
     values, starts = np.unique(tags[order], return_index=True)
-    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # of no values, split makes one part
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split returns one part for no values
 
 
 def _section(text: bytes, name: str) -> bytes:
-    """What stands between the lines $NAME and $EndNAME, first of all; names may hold such words."""
+    """Return the text between the first lines $NAME and $EndNAME; names of groups may contain such words."""
     head = f"${name}".encode()
     start = 0 if text.startswith(head) else text.find(b"\n" + head) + 1
     if not text.startswith(head, start):
@@ -177,14 +177,14 @@ def _section(text: bytes, name: str) -> bytes:
 
 
 def _physical_names(text: bytes) -> dict[tuple[int, int], str]:
-    """The names of physical groups by dimension and number: a name may be that of several."""
+    """Return the names of physical groups by dimension and number; several may have the same name."""
     lines = _section(text, "PhysicalNames").decode("utf-8", "replace").splitlines()
     matches = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
     return {(int(line[1]), abs(int(line[2]))): line[3] for line in matches if line is not None}
 
 
 def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]] | None:
-    """The physical groups of each entity, by dimension and number, of a file from version 4.1 on."""
+    """Return the physical groups of each entity, by dimension and number; None before version 4.1."""
     version, is_binary, size = _section(text, "MeshFormat").split(maxsplit=3)[:3]
     if not version.startswith(b"4") or version == b"4.0":
         return None
@@ -198,12 +198,12 @@ def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]] | None:
             take("<f8", 3 if dim == 0 else 6)  # a point, or a box
             groups_of[dim, tag] = take("<i4", take(n_bytes, 1)[0])
             if dim > 0:
-                take("<i4", take(n_bytes, 1)[0])  # the entities around it
+                take("<i4", take(n_bytes, 1)[0])  # the bounding entities
     return groups_of
 
 
 def _numbers(section: bytes) -> Callable[[str, int], list[int]]:
-    """A function that reads on: so many numbers of this dtype."""
+    """Return a function that reads the next numbers of a dtype."""
     at = 0
 
     def take(dtype: str, count: int) -> list[int]:
@@ -216,6 +216,6 @@ def _numbers(section: bytes) -> Callable[[str, int], list[int]]:
 
 
 def _words(section: bytes) -> Callable[[str, int], list[int]]:
-    """As `_numbers`, of a text."""
+    """Do the same as `_numbers` for text."""
     words = iter(section.split())
     return lambda dtype, count: [int(float(word)) for word in islice(words, count)]

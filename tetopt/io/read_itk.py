@@ -1,4 +1,4 @@
-"""NRRD, MetaImage and DICOM by SimpleITK, in a process of its own; headers and names are looked at before."""
+"""Reading of NRRD, MetaImage and DICOM by SimpleITK, in a separate process after checks of headers and names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
-# ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
+# ITK chooses its reader by the case-sensitive suffix; naming the reader also opens SCAN.MHA.
 ITK_READERS = {
     ".nrrd": "NrrdImageIO",
     ".nhdr": "NrrdImageIO",
@@ -28,15 +28,15 @@ ITK_READERS = {
     ".mhd": "MetaImageIO",
     ".dcm": "GDCMImageIO",
 }
-# DICOM slices may be off an even spacing by this fraction of it, since positions are often rounded.
+# DICOM slices may deviate from an even spacing by this fraction of it, because positions are often rounded.
 _UNEVEN_FRACTION = 0.05
-_SAME_PLACE_MM = 1e-3  # slices nearer to each other are of one place
-# Below a folder without DICOM files, so many are looked into, by so many of their files, and so many are listed.
+_SAME_PLACE_MM = 1e-3  # slices closer to each other share one position
+# In a folder without DICOM files: subfolders searched, files tried in each, and subfolders listed in the message.
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 
 
 def read_itk(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
-    """Data and affine of a file; InputError without the path before it."""
+    """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
     size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
     data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=value_bytes, library="SimpleITK")
@@ -44,12 +44,12 @@ def read_itk(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray
 
 
 def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    """Data and affine of the one DICOM series in a folder; InputError without the path before it."""
+    """Return data and affine of the one DICOM series in a folder; InputError without a leading path."""
     _check_installed()
     files = sorted(path.iterdir())
     for file in files:
         other = None if file.is_symlink() and not file.exists() else irregular(file)
-        if other not in (None, "a folder"):  # GDCM opens everything, and would wait for it
+        if other not in (None, "a folder"):  # GDCM opens everything and would block
             raise InputError(f"{file.name} is {other}; move it out of the folder of DICOM files")
     size = sum(file.stat().st_size for file in files if file.is_file())
     data, affine = read_apart(_series_of, path, volume, size=size, library="SimpleITK")
@@ -90,7 +90,7 @@ def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
         reader = sitk.ImageSeriesReader()
         files = _series_files(Path(path), reader)
         reader.SetFileNames(files)
-        # Keeps each slice's own position readable.
+        # Keep the position of each slice readable.
         reader.MetaDataDictionaryArrayUpdateOn()
         image = reader.Execute()
         _check_components(image.GetNumberOfComponentsPerPixel())
@@ -104,50 +104,50 @@ def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
 
 
 def _in_words(error: RuntimeError) -> InputError:
-    # The innermost cause stands last; the "Reason:" behind it is an unrelated errno.
+    # The innermost cause comes last; the "Reason:" after it is an unrelated errno.
     words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", one_line(error))[-1]
     return InputError(f"{UNREADABLE_FILE} (SimpleITK: {words.split(' Reason: ')[0]})")
 
 
 def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
-    """The files of the one DICOM series in a folder, in the order of their positions."""
+    """Return the files of the one DICOM series in a folder, in the order of their positions."""
     files = sorted(file for file in path.iterdir() if file.is_file())
     series = {uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))}
     known = {Path(file).name for names in series.values() for file in names}
     for file in files:
-        # GDCM passes over a damaged file in silence, which would shorten the volume.
+        # GDCM silently skips damaged files, which would shorten the volume.
         if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
             raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
     if not series:
         folders = islice(_dicom_folders(path), LISTED_FOLDERS)
         if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in folders):
-            raise InputError(f"no DICOM series in this folder itself; choose a folder in it: {below}")
-        raise InputError("no DICOM series in this folder, nor in the folders in it; check the path")
+            raise InputError(f"no DICOM series in this folder itself; choose one of its subfolders: {below}")
+        raise InputError("no DICOM series in this folder or its subfolders; check the path")
     if len(series) > 1:
         listed = ", ".join(f"{uid} ({len(names)} files)" for uid, names in series.items())
-        raise InputError(f"{len(series)} DICOM series in this folder, put one into its own folder: {listed}")
+        raise InputError(f"expected one DICOM series, got {len(series)}; put one into its own folder: {listed}")
     return next(iter(series.values()))
 
 
 def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
-    """The folders below one that hold DICOM files, as far as a look goes, with their numbers of files."""
+    """Yield subfolders that contain DICOM files, within limits, with their numbers of files."""
     for name, folders, files in islice(os.walk(path), WALKED_FOLDERS):
-        folders.sort()  # the order in which the walk goes on
+        folders.sort()  # the order in which the walk continues
         first = [Path(name, file) for file in sorted(files)[:TRIED_FILES]]
         if any(file.is_file() and _is_dicom(file) for file in first):
             yield Path(name), len(files)
 
 
 def _is_dicom(path: Path) -> bool:
-    """Whether a DICOM file's mark follows its 128 bytes of preamble."""
+    """Return whether a DICOM file's mark follows a preamble of 128 bytes."""
     with path.open("rb") as stream:
         return stream.read(132)[128:] == b"DICM"
 
 
 def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> None:
-    """Write the slice axis into `affine` from the slices' own positions, where the files have them.
+    """Write the slice axis to `affine` from the slices' own positions, if the files have them.
 
-    ITK squares a tilted gantry's axes and only warns of a missing slice; both would move anatomy unnoticed.
+    ITK orthogonalises the axes of a tilted gantry and only warns of a missing slice; both would silently move anatomy.
     """
     position, orientation = "0020|0032", "0020|0037"
     slices = range(n_slices)
@@ -160,9 +160,9 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
     n_places = len(np.unique(np.rint(points / _SAME_PLACE_MM), axis=0))
     if n_places < n_slices:
         raise InputError(
-            f"the {n_slices} slices of this DICOM series lie at {n_places} place{'s' * (n_places > 1)}: it holds "
+            f"the {n_slices} slices of this DICOM series have {n_places} position{'s' * (n_places > 1)}: it has "
             "several volumes (times, echoes or repeats); convert it to a 4-D NIfTI file, or put the slices of one "
-            "volume into a folder of their own"
+            "volume into a separate folder"
         )
     step = (points[-1] - points[0]) / (n_slices - 1)
     off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
@@ -175,12 +175,12 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
 
 
 def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
-    """Where slices at `points`, (n, 3), mm, are not even: the step unlike the others, else the place `off` (n,)."""
+    """Describe where slices at `points`, (n, 3), mm, are uneven: an unusual step, or else the largest `off` (n,)."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     usual = float(np.median(steps))
     is_other = np.abs(steps - usual) > _UNEVEN_FRACTION * usual
     if not is_other.any():
-        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off the line through the first and last"
+        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its even place between first and last"
     k = int(np.abs(steps - usual).argmax())
     where = "elsewhere" if is_other.sum() == 1 else "at most places"
     return (
@@ -190,23 +190,23 @@ def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
 
 
 def _numbers(value: str, count: int) -> list[float]:
-    """The numbers in a DICOM tag's text."""
+    """Parse the numbers in a DICOM tag."""
     try:
         numbers = [float(number) for number in value.split("\\")]
     except ValueError:
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InputError(f'a DICOM slice\'s place should be {count} numbers, got "{value}"; export it again')
+        raise InputError(f'expected {count} numbers for the position of a DICOM slice, got "{value}"; export it again')
     return numbers
 
 
 def _check_components(count: int) -> None:
     if count > 1:
-        raise InputError(f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first")
+        raise InputError(f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey first")
 
 
 def _ras_affine(source: Any) -> NDArray[np.float64]:
-    """RAS affine of a SimpleITK image or reader (LPS), of its first three axes or of its two."""
+    """Return the RAS affine of a SimpleITK image or reader (LPS), for its first three axes or its two."""
     n = min(source.GetDimension(), 3)
     direction = np.reshape(source.GetDirection(), (source.GetDimension(),) * 2)
     affine = np.eye(n + 1)

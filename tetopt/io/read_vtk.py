@@ -1,4 +1,4 @@
-"""VTU and VTK files as they are read: by VTK in a process of its own, after their heads were looked at here."""
+"""Reading of VTU and VTK files by VTK in a separate process, after checks of their headers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tetopt.io.raw import RawGrid
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
-# Counts in a VTU file's tags, and in the lines of a VTK file: each thing counted takes a byte at least.
+# Counts in the tags of a VTU file, and in the lines of a VTK file: each counted item takes at least one byte.
 XML_COUNT = re.compile(rb"<[^<>]{0,10000}?\b(NumberOf\w+)\s*=\s*[\"']\s*([-+]?\d+(?:\.\d*)?(?:[eE]\+?\d+)?)")
 LEGACY_COUNT = re.compile(
     rb"^(POINTS|CELLS|CELL_TYPES|POINT_DATA|CELL_DATA|OFFSETS|VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|[^\s]+ \d+)"
@@ -29,25 +29,25 @@ ENTITIES = re.compile(rb"<!(?:DOCTYPE|ENTITY)", re.I)
 
 
 def read_vtk(path: Path) -> RawGrid:
-    """The unstructured grid in a VTU or VTK file.
+    """Read the unstructured grid in a VTU or VTK file.
 
     Raises
     ------
     InputError
-        Without the path before it: a damaged file, or one that VTK crashes at; another data set; counts that the file
-        is too short for; a document type or entities; no cells.
+        Without a leading path: the file is damaged, or VTK crashes on it; it has another data set, counts that the file
+        is too short for, a document type or entities, or no cells.
     """
     check_counts(path)
     return checked_grid(*read_apart(arrays_of, path, library="VTK"))
 
 
 def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
-    """What `arrays_of` gives as a grid whose arrays fit one another.
+    """Convert the result of `arrays_of` to a grid after checking that its arrays are consistent.
 
     Raises
     ------
     InputError
-        As `read_vtk`.
+        For the reasons of `read_vtk`.
     """
     if errors:
         raise InputError(f"damaged, or not a VTK mesh ({errors})")
@@ -64,27 +64,27 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
 
 
 def check_counts(path: Path) -> None:
-    """InputError if the head tells of more than the file can have."""
+    """Raise InputError if the header announces more than the file can contain."""
     size = path.stat().st_size
     if size == 0:
         raise InputError("damaged: the file is empty")
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as whole:
         is_xml = path.suffix.lower() == ".vtu"
         if is_xml and ENTITIES.search(whole):
-            raise InputError("has a document type or entities, which no VTK file needs; not read")
+            raise InputError("it has a document type or entities, which no VTK file needs; save the mesh again")
         most = size * (DEFLATE_RATIO if is_xml and whole.find(b"compressor") >= 0 else 1)
         for match in (XML_COUNT if is_xml else LEGACY_COUNT).finditer(whole):
             name, number = match[1].decode("latin-1"), float(match[2])
             if not 0 <= number <= most:
                 count = match[2][:40].decode()
-                raise InputError(f"damaged: {name[:40]} is {count}, its {size} bytes can hold {most} at most")
+                raise InputError(f"damaged: {name[:40]} is {count}, its {size} bytes can hold at most {most}")
 
 
 # In the child
 
 
 def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
-    """The kind of data set, VTK's first complaint, and the arrays of a `RawGrid`."""
+    """Return the type of data set, VTK's first error, and the arrays of a `RawGrid`."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow, vtkUnsignedCharArray
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
@@ -96,7 +96,7 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     if isinstance(reader, vtkDataSetReader):
         for kind in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{kind}On")()
-    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # as bytes names that are not UTF-8, too
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # bytes, for names that are not UTF-8
     reader.Update()
     grid = reader.GetOutput()
     errors = _first_error(window.GetOutput())
@@ -106,12 +106,12 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     if kind != "UnstructuredGrid" or grid.GetNumberOfCells() == 0:
         return kind, "", {}
     types = vtkUnsignedCharArray()
-    types.DeepCopy(grid.GetCellTypesArray())  # which of cells of one kind may hold its number once
+    types.DeepCopy(grid.GetCellTypesArray())  # VTK may store it only once for cells of one type
     return kind, "", plain_arrays(grid) | {"cell_types": vtk_to_numpy(types).astype(np.uint8)}
 
 
 def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
-    """The arrays of a `RawGrid`, by name, of VTK's own, but for the types of cells."""
+    """Return the arrays of a `RawGrid` by name, except for cell types."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     cells = grid.GetCells()
@@ -126,17 +126,17 @@ def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
 
 
 def _first_error(output: str | bytes | None) -> str:
-    """The first of VTK's errors, on one line, without where in VTK it was; empty without any."""
-    text = output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""  # bytes if it is no UTF-8
+    """Return VTK's first error on one line, without its place in VTK; empty if there is none."""
+    text = output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""  # bytes if not UTF-8
     _, mark, rest = text.partition("ERROR: ")
     if not mark:
         return ""
     words = re.split(r"\n(?=ERROR|Warning|Generic)", rest)[0].partition("\n")[2] or rest
-    return re.sub(r" ?\(0x[0-9a-f]+\)", "", " ".join(words.split()))[:300] or "an error without words"
+    return re.sub(r" ?\(0x[0-9a-f]+\)", "", " ".join(words.split()))[:300] or "an error without a message"
 
 
 def _data_of(data: Any) -> dict[str, NDArray]:
-    """Arrays by name."""
+    """Return arrays by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkBitArray, vtkDataArray, vtkStringArray, vtkUnsignedCharArray
 

@@ -1,4 +1,4 @@
-"""A file that is written, and read back before it takes its name."""
+"""Writing of files that are read back before they take their name."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from pathlib import Path
 
 from tetopt.system.files import written_whole
 
-COMPARED_BYTES = 2**24  # of the file and of what was written, at a time: so much more memory
+COMPARED_BYTES = 2**24  # compared at a time, which limits additional memory
 
 
 def save_checked(path: Path, whole: bytes) -> None:
-    """Write a file, whole or not at all, and compare what reads back before it takes its name.
+    """Write a file, whole or not at all, and compare it with what reads back before it takes its name.
 
     Raises
     ------
     OSError
-        As `tetopt.system.files.written_whole`; the file has other bytes.
+        For the reasons of `tetopt.system.files.written_whole`; the file reads back differently.
     """
     with written_whole(path, len(whole)) as temporary:
         temporary.write_bytes(whole)
@@ -24,4 +24,4 @@ def save_checked(path: Path, whole: bytes) -> None:
             starts = range(0, len(whole) + 1, COMPARED_BYTES)
             is_same = all(file.read(COMPARED_BYTES) == whole[at : at + COMPARED_BYTES] for at in starts)
         if not is_same:
-            raise OSError(errno.EIO, "what was written reads back otherwise; is the disk sound?")
+            raise OSError(errno.EIO, "the file reads back differently from what was written; check the disk")

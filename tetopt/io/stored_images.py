@@ -1,4 +1,4 @@
-"""Images that need not fit into memory: folders of Zarr and files that are not compressed, opened but not read."""
+"""Images that may exceed memory: Zarr folders and uncompressed files, opened without reading their voxels."""
 
 from __future__ import annotations
 
@@ -33,41 +33,41 @@ _PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
 
 
 def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> Image:
-    """An image whose voxels are left where they are.
+    """Open an image whose voxels stay in their file.
 
     Parameters
     ----------
     path : str or Path
-        A folder of Zarr: an OME-Zarr image (NGFF 0.4, 0.5; Zarr's format 2 or 3), of whose multiscale the first level
-        is taken, or an array with the attribute "affine". An uncompressed file of NIfTI (.nii).
+        A Zarr folder: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), of which the first multiscale level is
+        used, or an array with the attribute "affine". Or an uncompressed NIfTI file (.nii).
     volume : int, optional
-        Which of several, from 0: of a file as in `tetopt.load_image`, of Zarr along its axes of time, channels
-        and others, of which the last runs fastest.
+        One of several volumes, from 0: for files as in `tetopt.load_image`, for Zarr along its axes of time, channels
+        and others, of which the last varies fastest.
     crop : sequence of three (start, stop), optional
         Keep a box of voxels, as in `tetopt.load_image`.
 
     Returns
     -------
     Image
-        What it reads of a file is what `tetopt.load_image` has there, to the bit, and so is the affine. A box that
-        cannot be read is an InputError that names the voxels.
+        Its voxels and affine equal those of `tetopt.load_image` to the last bit. A box that cannot be read raises an
+        InputError that names the voxels.
 
     Raises
     ------
     InputError
-        ``"<path>: ..."`` in one line: as `tetopt.load_image`; a kind of file that cannot be read in parts; a place on
-        the network; Zarr's metadata damaged, without a scale, with other than three axes in space or units that are no
-        lengths; values that are no real numbers; codecs that are not known; chunks that are missing where nothing says
-        what stands for them, or all of them.
+        ``"<path>: ..."`` in one line: the reasons of `tetopt.load_image`; the file cannot be read in parts, or is on
+        the network; Zarr metadata are damaged, without a scale, do not have three spatial axes, or have units that are
+        not lengths; values are not real numbers; codecs are unknown; chunks without a fill value are missing, or all
+        chunks.
 
     Warns
     -----
     UserWarning
-        No orientation, no unit; chunks that are missing and have a fill value; a box of an odd size.
+        The image has no orientation or no unit; chunks with a fill value are missing; the size of its box is unusual.
 
     See Also
     --------
-    load_image : Reads all voxels.
+    load_image : Read all voxels.
 
     Examples
     --------
@@ -95,15 +95,15 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
 
 
 def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = None) -> Image | None:
-    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, in its own place.
+    """Open the finest level of an OME-Zarr image with at most `most_voxels` voxels, for pictures.
 
-    Its voxels stay in the file until they are drawn, but are read once, so that what is wrong with them shows. None of
-    an image without such a level, and of files that have no levels.
+    Its voxels stay in the file until they are drawn, but are read once here to detect errors. Returns None for an image
+    without such a level, and for files without levels.
 
     Raises
     ------
     InputError
-        As `open_stored`.
+        For the reasons of `open_stored`.
     """
     check_local(path)
     path = Path(path)
@@ -123,16 +123,16 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
 
 
 def stored_checksum(path: str | Path) -> str:
-    """SHA-256 of what shows whether an image has changed, without its voxels being read.
+    """Return a SHA-256 that changes with an image, without reading its voxels.
 
-    Of a folder of Zarr: names, lengths and times of the last change of all its files, and what is in those of metadata.
-    Of a file, and of those beside a header that have its voxels: name, length and time. Two copies of an image have two
-    of these; `tetopt.io.images.sha256` is the same for both, and takes as long as reading them.
+    For a Zarr folder it covers names, lengths and modification times of all files, and the contents of metadata files.
+    For a file, and the data files of a header, it covers name, length and modification time. Two copies of an image
+    have different checksums; `tetopt.io.images.sha256` is the same for both, but takes as long as reading them.
 
     Raises
     ------
     InputError
-        As `tetopt.io.images.sha256`.
+        For the reasons of `tetopt.io.images.sha256`.
     """
     path = Path(path)
     with os_errors_named(path):
@@ -146,9 +146,9 @@ def stored_checksum(path: str | Path) -> str:
 
 
 def check_local(path: str | Path) -> None:
-    """InputError for a place on the network, whatever becomes of its slashes in a `Path`."""
+    """Raise InputError for a URL, even if a `Path` has changed its slashes."""
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(path)):
-        raise InputError(f"{path}: is not on this machine; download it, only folders and files here are read")
+        raise InputError(f"{path}: expected a local file or folder, got a URL; download it first")
 
 
 def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
@@ -156,14 +156,14 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
         if is_zarr(path):
             return open_zarr(zarr_levels(path, notes)[0], volume)
         if path.is_dir():
-            raise InputError("a folder that is none of Zarr's; convert it to .zarr or .nii first")
+            raise InputError("expected a Zarr folder, got another folder; convert it to .zarr or .nii first")
     name = check_beginning(path)
     if name.endswith(".nii"):
         return _mapped_nifti(path, volume, notes)
     if name.endswith(HEADED_SUFFIXES):
-        raise InputError("is read whole, not in parts; convert it to .zarr or uncompressed .nii first")
+        raise InputError("this format cannot be read in parts; convert it to .zarr or uncompressed .nii first")
     if name.endswith(_PACKED_SUFFIXES):
-        raise InputError("is compressed, and cannot be read in parts; unpack it, or convert it to .zarr, first")
+        raise InputError("a compressed file cannot be read in parts; unpack it or convert it to .zarr first")
     raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
 
 
@@ -174,7 +174,7 @@ def _cropped(image: Image, ranges: list[tuple[int, int]]) -> Image:
 
 
 class _Scaled:
-    """A mapped array whose values are scaled as nibabel scales them; its own slices take 30 times as long, if thin."""
+    """A mapped array with nibabel's scaling of values; nibabel's own thin slices take 30 times as long."""
 
     def __init__(self, mapped: np.memmap, slope: float, inter: float) -> None:
         self.mapped, self.shape, self.dtype = mapped, mapped.shape, mapped.dtype
@@ -187,11 +187,11 @@ class _Scaled:
 def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> Image:
     proxy, index, affine = nibabel_voxels(path, volume, notes)
     if len(proxy.shape) < 3:
-        raise InputError(f"expected a volume, got a plane of {proxy.shape} voxels")
+        raise InputError(f"expected a 3-D image, got {proxy.shape} voxels")
     shape = tuple(int(size) for size in proxy.shape)
     with os_errors_named():
         mapped = np.memmap(path, proxy.dtype, "r", int(proxy.offset), shape, order="F")
     scaled = _Scaled(mapped, proxy.slope, proxy.inter)
     voxels = VoxelsInFile(path, scaled, (*(slice(0, size) for size in shape[:3]), *index))
-    voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
+    voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # of scaled values
     return Image.stored(voxels, affine)

@@ -1,4 +1,4 @@
-"""Triangle surfaces as STL, PLY, and VTK's VTP and VTK files; all but STL hold whole numbers of each triangle."""
+"""Triangle surfaces as STL, PLY, VTP and VTK files; all except STL can store integers for each triangle."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ if TYPE_CHECKING:
     import pyvista
 
 SURFACE_SUFFIXES = (".stl", ".ply", ".vtp", ".vtk")
-LABELLED_SUFFIXES = SURFACE_SUFFIXES[1:]  # that hold labels of triangles
+LABELLED_SUFFIXES = SURFACE_SUFFIXES[1:]  # formats with labels of triangles
 
-# 3D Slicer looks for this in an STL or VTK file's header and in each comment of a PLY file, or for a text of this name
-# in a VTP file, and takes points for LPS, x and y negated, where it finds nothing: Slicer/Slicer,
+# 3D Slicer looks for this in the header of an STL or VTK file, in the comments of a PLY file, or for a text of this
+# name in a VTP file; if it is missing, Slicer assumes LPS, with x and y negated: Slicer/Slicer,
 # Libs/MRML/Core/vtkMRMLModelStorageNode.cxx, GetCoordinateSystemFromFileHeader and ...FromFieldData;
 # https://discourse.slicer.org/t/10446.
 SPACE_KEY = "SPACE="
 
-Labels = Mapping[str, NDArray[np.integer]]  # by name, one number of 32 bits for each triangle
+Labels = Mapping[str, NDArray[np.integer]]  # by name, one 32-bit number per triangle
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_FACE = np.dtype([("count", "u1"), ("nodes", "<i4", 3)])
 
 
 class SurfaceCheck(NamedTuple):
-    """What trimesh finds in a surface file."""
+    """Properties of a surface file, computed by trimesh."""
 
     is_watertight: bool  # each edge in exactly two triangles
-    is_winding_consistent: bool  # which run along it in opposite ways
-    volume: float  # mm^3, positive where normals point out
+    is_winding_consistent: bool  # which traverse it in opposite directions
+    volume: float  # mm^3, positive if normals point outwards
     area: float  # mm^2
-    n_pieces: int  # closed surfaces that are not connected; a cavity's wall counts as one
+    n_pieces: int  # number of disconnected closed surfaces; the wall of a cavity counts as one
 
 
 def save_surface(
@@ -51,9 +51,9 @@ def save_surface(
 ) -> None:
     """Write a binary STL, PLY, VTP or VTK file, by the name's suffix, whole or not at all.
 
-    The header says the coordinates' convention in the words that 3D Slicer looks for. All but STL, which rounds to
-    float32, hold every bit of the points and their order. Replaces an existing file; ask
-    `tetopt.system.files.checked_output` first.
+    The header states the coordinates' convention in 3D Slicer's form. All formats except STL, which rounds to float32,
+    keep every bit of the points and their order. Replaces an existing file; call `tetopt.system.files.checked_output`
+    first.
 
     Parameters
     ----------
@@ -62,16 +62,16 @@ def save_surface(
     surface : Surface
         World mm, RAS+.
     about : str, optional
-        For the header, in one line of ASCII, of which STL keeps the first 60 characters, and VTP nothing.
+        One line of ASCII for the header; STL keeps the first 60 characters, VTP nothing.
     space : {"ras", "lps"}
-        Convention of the file's coordinates; with "lps" x and y change sign.
-    labels : dict of (K,) arrays of whole numbers, optional
-        Of the triangles, by name: properties of the faces in PLY, cell data in VTK's.
+        Convention of the file's coordinates; with "lps" the signs of x and y are reversed.
+    labels : dict of (K,) arrays of integers, optional
+        Labels of triangles, by name: face properties in PLY, cell data in VTK's formats.
 
     Raises
     ------
     InputError
-        Another suffix, or labels in an STL file, which has no room for them.
+        The suffix is unknown; labels are given for an STL file, which cannot store them.
 
     Examples
     --------
@@ -84,13 +84,13 @@ def save_surface(
     path = Path(path)
     writers = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".vtk": _vtk}
     if path.suffix.lower() not in writers:
-        raise InputError(f"{path}: expected a surface named {' or '.join(SURFACE_SUFFIXES)}")
+        raise InputError(f"{path}: expected a name ending in {' or '.join(SURFACE_SUFFIXES)}")
     if labels and path.suffix.lower() not in LABELLED_SUFFIXES:
-        raise InputError(f"{path}: STL holds no labels of triangles; take {' or '.join(LABELLED_SUFFIXES)}")
+        raise InputError(f"{path}: STL cannot store labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
     if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
         raise InputError(
-            f"{path}: labels of triangles are called by a letter, then up to {MOST_LETTERS - 1} letters, digits, _ and "
-            f'-, got "{plain(odd[0])}"; call them otherwise'
+            f"{path}: expected names of labels of a letter and up to {MOST_LETTERS - 1} letters, digits, _ and "
+            f'-, got "{plain(odd[0])}"; rename them'
         )
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
@@ -99,32 +99,32 @@ def save_surface(
 
 
 def boundary_stl(model: Model) -> bytes:
-    """The model's boundary, watertight, as the bytes of an STL file; nothing else of the model is in it."""
+    """Return the model's watertight boundary as an STL file, without any other data."""
     return _stl(*_boundary(model), {})
 
 
 def boundary_ply(model: Model) -> bytes:
-    """The model's boundary, watertight, as the bytes of a PLY file; nothing else of the model is in it."""
+    """Return the model's watertight boundary as a PLY file, without any other data."""
     return _ply(*_boundary(model), {})
 
 
 def _boundary(model: Model) -> tuple[Surface, str, str]:
-    """The surface, what its file says of it, and the space of its points."""
+    """Return the surface, a text for its file, and the space of its points."""
     if model.mesh.ndim != 3:
-        raise InputError("surface: expected tetrahedra, whose boundary is a surface, got triangles")
+        raise InputError("surface: expected a tetrahedral mesh, got triangles")
     surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
     return surface, str(model.about.get("image", "")), model.space
 
 
 def checked_surface(path: str | Path) -> SurfaceCheck:
-    """Read a surface file, have trimesh weld nodes of the same place, and look whether it is closed.
+    """Read a surface file, merge nodes in the same place, and check whether it is closed, by trimesh.
 
-    STL and PLY are read by trimesh as well, the others by VTK.
+    trimesh reads STL and PLY, VTK reads the other formats.
 
     Raises
     ------
     InputError
-        A missing file, or one that holds no triangles or cannot be read.
+        The file is missing, has no triangles, or cannot be read.
     """
 
     if not Path(path).is_file():
@@ -132,10 +132,10 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     try:
         surface = _from_vtk(Path(path)) if Path(path).suffix.lower() in (".vtp", ".vtk") else _from_trimesh(Path(path))
         n_triangles = len(surface.faces)
-    except Exception as error:  # trimesh raises whatever it pleases on damaged files
+    except Exception as error:  # trimesh raises any error on damaged files
         raise InputError(f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?") from error
     if n_triangles == 0:
-        raise InputError(f"{path}: expected a surface of triangles, found none; damaged?")
+        raise InputError(f"{path}: expected a surface of triangles, found none; is it damaged?")
     return SurfaceCheck(
         bool(surface.is_watertight),
         bool(surface.is_winding_consistent),
@@ -146,7 +146,7 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
 
 
 def _from_trimesh(path: Path) -> Any:
-    """The triangles of an STL or PLY file, opened here, as names that are not UTF-8 are beyond trimesh."""
+    """Read the triangles of an STL or PLY file; it is opened here, as trimesh cannot open names that are not UTF-8."""
     import trimesh
 
     with path.open("rb") as stream:
@@ -154,26 +154,26 @@ def _from_trimesh(path: Path) -> Any:
 
 
 def _from_vtk(path: Path) -> Any:
-    """The triangles of one of VTK's files as trimesh has them."""
+    """Read the triangles of a VTK or VTP file as a trimesh."""
     import pyvista
     import trimesh
     from vtkmodules.vtkIOLegacy import vtkPolyDataReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     reader = (vtkXMLPolyDataReader if path.suffix.lower() == ".vtp" else vtkPolyDataReader)()
-    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # as bytes names that are not UTF-8, too
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # bytes, for names that are not UTF-8
     reader.Update()
     grid = pyvista.wrap(reader.GetOutput())
     return trimesh.Trimesh(np.asarray(grid.points, dtype=np.float64), grid.regular_faces)
 
 
 def _ascii_line(about: str) -> str:
-    """One line of ASCII."""
+    """Convert a text to one line of ASCII."""
     return plain(" ".join(about.split())).encode("ascii", "replace").decode()
 
 
 def _stl(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
-    # A binary file must not begin with "solid", by which some readers know a file of text.
+    # A binary file must not begin with "solid", by which some readers recognise text files.
     header = f"tetopt {SPACE_KEY}{space.upper()} mm {_ascii_line(about)}".encode()[:80].ljust(80)
     triangles = np.zeros(len(surface.triangles), dtype=STL_TRIANGLE)
     corners = surface.points[surface.triangles]
@@ -222,7 +222,7 @@ def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
 
 
 def _grid(surface: Surface, labels: Labels) -> pyvista.PolyData:
-    import pyvista  # slow to load, and with VTK only needed here
+    import pyvista  # slow to import, and only needed here
 
     grid = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
     for name, values in labels.items():

@@ -1,12 +1,12 @@
-"""What mesh formats share that know numbers for materials and sets, and comments for the rest.
+"""Shared code of mesh formats that have numbers for materials and sets, and comments for other data.
 
-`numbered_parts` gives each cell and each facet of a set one number. Where cells have labels, that of a cell is its
-label; label 0, which formats take for none, has the number after the largest label. Otherwise it is that of its
-material, or without materials that of its cell set. What sets, or materials, divide has a number for each of its parts,
-behind all others. The numbers of facets differ from those of cells. For a given R, those of the box's faces,
-"mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets count from R + 1 in
-their order, so that their numbers depend on the sets that the mesh has. R is 1000, or the power of ten that is above
-all labels. Parts have those from 2 R + 1 on.
+`numbered_parts` gives each cell and each facet of a set one number. If cells have labels, the number of a cell is its
+label; label 0, which formats treat as none, gets the number after the largest label. Otherwise it is the number of the
+cell's material, or without materials that of its cell set. If sets or materials divide such a group, each of its parts
+has its own number, after all others. The numbers of facets differ from those of cells. For a given R, those of the
+box's faces, "mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets are
+numbered from R + 1 in order, so that their numbers depend on the sets of the mesh. R is 1000, or a power of ten above
+all labels. Parts are numbered from 2 R + 1.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described
 from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, MOST_LETTERS, free_name, label_set_names
 
-UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
-LEAST_ROOM = 1000  # so many numbers are the labels' alone
-LARGEST_GROUP = 10**8 - 1  # of labels: twice the power of ten behind it still fits into the format's 32 bits
+UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
+LEAST_ROOM = 1000  # numbers reserved for labels
+LARGEST_GROUP = 10**8 - 1  # largest label: twice the next power of ten still fits into the format's 32 bits
 
 
 class Tagged(NamedTuple):
-    """Overlapping sets as tags, one an item, for formats that know no more: an item's tag tells all of its sets."""
+    """Overlapping sets as one tag per item, for formats that allow only one: the tag identifies all sets of an item."""
 
-    items: NDArray[np.int64]  # (T,) or (T, 2): every cell or facet that is in any set, ascending
+    items: NDArray[np.int64]  # (T,) or (T, 2): all cells or facets in sets, ascending
     tags: NDArray[np.int64]  # (T,) from 1
-    tags_of: dict[str, list[int]]  # the tags that make up each set
+    tags_of: dict[str, list[int]]  # the tags of each set
 
 
 class Part(NamedTuple):
-    """The elements of one dimension. Entities and groups of them are gmsh's; other formats have entities alone."""
+    """The elements of one dimension. Entities and groups are gmsh's terms; other formats have only entities."""
 
     dim: int
     numbers: NDArray[np.int64]  # (E,) from 1
     rows: NDArray[np.int64]  # (E,) cells, or (E, 2) facets
-    entities: NDArray[np.int64]  # (E,) the number of each one's entity
-    groups_of: dict[int, list[int]]  # the numbers of each entity's physical groups, the smallest set first; ascending
-    names: dict[int, str]  # of the groups by number
-    sets: dict[str, list[int]]  # the entities that make up each set
+    entities: NDArray[np.int64]  # (E,) the number of each element's entity
+    groups_of: dict[int, list[int]]  # by entity, ascending: the numbers of its physical groups, the smallest set first
+    names: dict[int, str]  # names of the groups, by number
+    sets: dict[str, list[int]]  # the entities of each set
 
 
 def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
-    """One tag for each combination of sets that some item is in, from 1 in the order of the first such items.
+    """Return one tag for each combination of sets that occurs, from 1 in the order of first occurrence.
 
     Examples
     --------
@@ -76,14 +76,14 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
 
 def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
-    """Every cell, with one tag for each combination of a label, a material ("material_1", ...) and cell sets.
+    """Return all cells, with one tag for each combination of label, material ("material_1", ...) and cell sets.
 
-    Without `labels` (M,) tags go by material: they are the materials' numbers from 1 where no set divides one.
+    Without `labels` (M,), tags follow materials: they are the materials' numbers from 1 if no set divides one.
 
     Raises
     ------
     InputError
-        A cell set that is called as a material is.
+        A cell set has the name of a material.
     """
     names = material_names(model, model.sets.cells)
     combined = tagged(model.sets.cells)
@@ -94,16 +94,16 @@ def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
     kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
     ends = np.cumsum(np.bincount(kinds[:, 1], minlength=len(names)))[:-1]
     of_material = np.split(np.argsort(kinds[:, 1], kind="stable") + 1, ends)
-    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}  # without names, one part
+    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}  # one part without names
     for name, tags in combined.tags_of.items():
         tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 2], tags)) + 1).tolist()
     return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
 
 
 def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
-    """`tagged` of facet sets, where a facet that sets hold from both of its sides is one item.
+    """Return `tagged` for facet sets; a facet that sets hold from both of its sides is one item.
 
-    It is held as by the first set that has it; items are in the order of the facets' nodes.
+    It is listed as in the first set that contains it; items are in the order of the facets' nodes.
     """
     of_cell = facets(mesh.cells).of_cell
     numbers = {name: of_cell[rows[:, 0], rows[:, 1]] for name, rows in sets.items()}
@@ -115,12 +115,12 @@ def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
 
 def group_of_zero(labels: NDArray[np.int64]) -> int:
-    """The number of label 0, since formats take 0 for none: the first behind all labels."""
+    """Return the number of label 0, the first after all labels, because 0 means none in the formats."""
     return int(labels.max()) + 1
 
 
 def group_labels(model: Model) -> NDArray[np.int64] | None:
-    """The cells' labels (M,), if they have any; InputError for one that is too large for a number of 32 bits."""
+    """Return the cells' labels (M,), if any; InputError for a label that does not fit into 32 bits."""
     labels = labels_of(model.cell_data, len(model.mesh.cells))
     if labels is not None and labels.max() > LARGEST_GROUP:
         raise InputError(f"expected labels up to {LARGEST_GROUP}, got {labels.max()}; renumber them from 1")
@@ -128,7 +128,7 @@ def group_labels(model: Model) -> NDArray[np.int64] | None:
 
 
 def without_labels(model: Model) -> Model:
-    """The model without the labels, where numbers tell them."""
+    """Return the model without labels if numbers represent them."""
     of_cells = model.cell_data.items()
     return (
         model if group_labels(model) is None else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
@@ -136,12 +136,12 @@ def without_labels(model: Model) -> Model:
 
 
 def numbered_parts(model: Model) -> tuple[Part, Part]:
-    """The cells, and the facets that are in sets; see the module for their numbers.
+    """Return the cells, and the facets in sets; the module describes their numbers.
 
     Raises
     ------
     InputError
-        A set that is called as a material, a label or the cells of no set are; a label beyond `LARGEST_GROUP`.
+        A set has the name of a material, a label or the group of other cells; a label exceeds `LARGEST_GROUP`.
     """
     labels, n_facets = group_labels(model), len(model.sets.facets)
     names, group = _cell_groups(model, labels)
@@ -155,9 +155,9 @@ def numbered_parts(model: Model) -> tuple[Part, Part]:
 
 
 def _part(dim: int, of_items: Tagged, groups_of: list[list[int]], names: dict[int, str], first: int, room: int) -> Part:
-    """The elements, numbered from `first`, of each tag an entity.
+    """Return the elements, numbered from `first`, with one entity for each tag.
 
-    It has the number of its first group; where that is several, each has one from `room` on.
+    An entity has the number of its first group; if the group has several entities, they are numbered after `room`.
     """
     counts, free = Counter(groups[0] for groups in groups_of), count(room + 1)
     number = np.array([groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of], dtype=np.int64)
@@ -168,7 +168,7 @@ def _part(dim: int, of_items: Tagged, groups_of: list[list[int]], names: dict[in
 
 
 def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[int, str], NDArray[np.int64]]:
-    """The names of the cells' groups by number, ascending, and the number of each cell's."""
+    """Return the names of the cells' groups by number, ascending, and the number of each cell's group."""
     if labels is not None:
         kinds = np.unique(labels).tolist()
         called = label_set_names(kinds, table_of_words(model.about.get(TABLE_TEXT)).names)
@@ -190,7 +190,7 @@ def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[i
 
 
 def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
-    """Cell sets that do not overlap those before, and the number from 1 of each cell's, or of "unnamed"."""
+    """Return cell sets that do not overlap previous ones, and the number, from 1, of each cell's set or "unnamed"."""
     names: list[str] = []
     number = np.zeros(len(model.mesh.cells), dtype=np.int64)
     for name, members in model.sets.cells.items():
@@ -205,7 +205,7 @@ def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _facets(model: Model, room: int) -> Part:
-    """Every facet of a set; an entity is what is in the same sets."""
+    """Return all facets in sets; facets in the same sets form an entity."""
     sets = model.sets.facets
     last = [*(name for pair in FACE_NAMES[model.mesh.ndim] for name in pair), MASK_SURFACE_SET, BOUNDARY_SET]
     of_box = dict(zip(last, count(2 * room - len(last)), strict=False))
@@ -221,17 +221,17 @@ def _facets(model: Model, room: int) -> Part:
 
 
 def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[str]:
-    """ "material_1", ... of the model's materials; InputError if a set among `taken` is called that."""
+    """Return names "material_1", ... of the model's materials; InputError if a set in `taken` has such a name."""
     names = [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
     check_apart(names, taken)
     return names
 
 
 def named_materials(model: Model) -> list[str]:
-    """Names of the model's materials by their labels: "liver", or "label_5" of one without a name.
+    """Return names of the model's materials by labels: "liver", or "label_5" for a label without a name.
 
-    A material of several whole labels has their names joined, and those that divide a label have its name and a number.
-    What remains, as of materials that are parts of several labels, is "material_1", ...
+    A material of several whole labels gets their joined names; materials that divide a label get its name and a number.
+    The others, which are parts of several labels, are "material_1", ...
     """
     names = material_names(model, {})
     labels = labels_of(model.cell_data, len(model.mesh.cells))
@@ -259,14 +259,14 @@ def named_materials(model: Model) -> list[str]:
 
 
 def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
-    """InputError if a set is called as something else in the file is."""
+    """Raise InputError if a set has a name that the file uses for something else."""
     lower = {name.lower() for name in names}
     if both := [name for name in taken if name.lower() in lower]:
-        raise InputError(f'set {both[0]}: the file calls something else "{both[0]}"; call the set otherwise')
+        raise InputError(f'set {both[0]}: the file uses the name "{both[0]}" for something else; rename the set')
 
 
 def remarks(model: Model) -> list[str]:
-    """Lines for the head of a mesh file: `described`, each material's constants, the loads."""
+    """Return lines for the header of a mesh file: `described`, each material's constants, the loads."""
     lines = described(model)
     if model.materials is not None:
         pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
@@ -276,20 +276,20 @@ def remarks(model: Model) -> list[str]:
             f"material_{k}: young {young!r} {model.units}, nu {nu!r}{mass}"
             for k, ((young, nu), mass) in enumerate(zip(pairs, masses, strict=True), 1)
         ]
-    lines += [f"load, which this format has no place for: {load_words(load)}" for load in model.loads]
+    lines += [f"load (not supported by this format): {load_words(load)}" for load in model.loads]
     return lines
 
 
 def without_data(model: Model) -> list[str]:
-    """Lines for the head of a file whose format has no place for cell data and point data."""
+    """Return lines for the header of a file whose format does not support cell data and point data."""
     left_out = {"cell data": model.cell_data, "point data": model.point_data}
-    return [f"{what}, which this format has no place for: {', '.join(data)}" for what, data in left_out.items() if data]
+    return [f"{what} (not supported by this format): {', '.join(data)}" for what, data in left_out.items() if data]
 
 
 def as_columns(fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = ()) -> dict[str, NDArray]:
-    """Cell or point data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ...
+    """Split cell or point data into scalars by name: columns are numbered NAME_0, NAME_1, ...
 
-    Rows of one of the `shapes` stay as they are. A column that is then called as another field is takes another name.
+    Rows with one of the `shapes` are kept whole. A column with the name of another field is renamed.
     """
     whole = {name for name, values in fields.items() if values.ndim == 1 or values.shape[1:] in shapes}
     columns: dict[str, NDArray] = {}
@@ -303,7 +303,7 @@ def as_columns(fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = 
 
 
 def all_sets(part: Part) -> dict[str, list[int]]:
-    """The entities that make up each set, and each label whose cells are no set, by name."""
+    """Return the entities of each set, and of each label that is not a set, by name."""
     groups = {name: number for number, name in part.names.items() if name not in part.sets and name != UNNAMED_GROUP}
     return part.sets | {
         name: [each for each, those in part.groups_of.items() if number in those] for name, number in groups.items()
@@ -311,22 +311,22 @@ def all_sets(part: Part) -> dict[str, list[int]]:
 
 
 def label_lines(model: Model, cells: Part, what: str) -> list[str]:
-    """How the numbers of cells, each `what` ("attribute"), tell labels, in words for the file's head and the run."""
+    """Describe how the numbers of cells, called `what` ("attribute"), represent labels, for the header and the run."""
     labels = group_labels(model)
     if labels is None:
         return []
     divided = sorted({group for number, (group,) in cells.groups_of.items() if number != group})
     zero, lines = group_of_zero(labels), [f"the {what} of a cell is its label"]
     if zero in cells.names and zero not in divided:
-        lines.append(f"label 0 is {what} {zero}, since 0 means none")
+        lines.append(f"label 0 is {what} {zero}, because 0 means none")
     if divided:
         first, names = min(cells.groups_of.keys() - cells.names), ", ".join(cells.names[group] for group in divided)
-        lines[0] += f", but where a set or material divides it: each part has a number from {first} on ({names})"
+        lines[0] += f", unless a set or material divides it: then each part has a number from {first} on ({names})"
     return lines
 
 
 def tag_lines(tags_of: dict[str, list[int]], what: str) -> list[str]:
-    """What each tag stands for, one line a tag."""
+    """Return one line for each tag, with its sets."""
     names: dict[int, list[str]] = {}
     for name, tags in tags_of.items():
         for tag in tags:

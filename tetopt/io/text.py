@@ -1,24 +1,24 @@
-"""Arrays as the lines of a text file, fast and without loss; foreign text as a line that does no harm."""
+"""Conversion of arrays to lines of text, fast and lossless, and of untrusted text to safe lines."""
 
 from __future__ import annotations
 
 import re
 import unicodedata
 from collections.abc import Callable, Container, Iterable
-from html import escape  # not of xml.sax, which loads urllib.request and all that goes through a network, 0.02 s
+from html import escape  # not from xml.sax, which imports urllib.request and network modules, 0.02 s
 from itertools import accumulate, chain, count
 from urllib.parse import quote
 
 from numpy.typing import NDArray
 
-NUMBERS_PER_LINE = 16  # Abaqus takes no more
-# Of a field's name where readers have lines of 256 characters: gmsh's, and legacy VTK's, percent-encoded there.
+NUMBERS_PER_LINE = 16  # the maximum in Abaqus
+# In a field's name, as some readers have lines of 256 characters: gmsh, and legacy VTK, percent-encoded there.
 MOST_NAME_CHARACTERS = 240
-UNNAMED_FIELD = "unnamed"  # VTK cannot read a file again that has a field without a name
+UNNAMED_FIELD = "unnamed"  # VTK cannot read back a file with a field without a name
 
 
 def rows(*columns: NDArray, separator: str = " ") -> str:
-    """One line for each row of the arrays side by side, each (K,) or (K, w); floats so that they read back the same.
+    """Format arrays side by side, each (K,) or (K, w), as one line per row; floats read back unchanged.
 
     Examples
     --------
@@ -33,10 +33,10 @@ def rows(*columns: NDArray, separator: str = " ") -> str:
 
 
 def plain(text: str) -> str:
-    r"""Foreign text on one line of printable characters, for terminals, comments and names of all kinds.
+    r"""Convert untrusted text to one line of printable characters, for terminals, comments and names.
 
-    What is not printed is shown as Python escapes it: line breaks, control characters, marks that turn the direction of
-    writing, and lone surrogates, as which bytes of a file's name come that are no UTF-8. Spaces of any width stay.
+    Unprintable characters are shown as Python escapes: line breaks, control characters, marks that reverse the
+    direction of writing, and lone surrogates from names of files that are not UTF-8. Spaces of any width are kept.
 
     Examples
     --------
@@ -55,12 +55,12 @@ def _escaped(letter: str) -> str:
 
 
 def file_name(name: str) -> str:
-    """A field's name as every format can hold it: `plain`, and not without a letter."""
+    """Return a field's name as all formats support it: `plain` and not blank."""
     return plain(name) if name.strip() else UNNAMED_FIELD
 
 
 def short_name(name: str) -> str:
-    """The first letters of a `file_name`, as many as fit into `MOST_NAME_CHARACTERS`, percent-encoded."""
+    """Return as many letters of a `file_name` as fit into `MOST_NAME_CHARACTERS` when percent-encoded."""
     name = file_name(name)
     if len(name) <= MOST_NAME_CHARACTERS and len(quote(name)) <= MOST_NAME_CHARACTERS:
         return name
@@ -69,7 +69,7 @@ def short_name(name: str) -> str:
 
 
 def legacy_name(name: str) -> str:
-    """A `short_name` without braces, which VTK's writer of legacy files takes for its own marks, and ends at.
+    """Return a `short_name` without braces, which VTK's legacy writer misreads as its own marks and crashes on.
 
     Examples
     --------
@@ -80,9 +80,9 @@ def legacy_name(name: str) -> str:
 
 
 def names_apart(names: Iterable[str], shown: Callable[[str], str]) -> dict[str, str]:
-    """What each of some names becomes: `shown` of it, numbered where another is called so.
+    """Map names to `shown` names, numbered if several would be equal.
 
-    Those that can keep their names do.
+    Names that need no change keep their form.
 
     Examples
     --------
@@ -100,27 +100,27 @@ def names_apart(names: Iterable[str], shown: Callable[[str], str]) -> dict[str, 
 
 
 def free_text(text: str, taken: Container[str]) -> str:
-    """The text, numbered from 2 where it is taken."""
+    """Return the text, numbered from 2 if it is taken."""
     return next(each for each in chain([text], (f"{text}_{number}" for number in count(2))) if each not in taken)
 
 
 def comment_lines(lines: Iterable[str], mark: str = "") -> str:
-    """A line for each of some texts, whatever they hold, that begins with a format's mark of comments."""
+    """Format texts of any content as one comment line each, beginning with a format's comment mark."""
     return "".join(f"{mark}{plain(line)}\n" for line in lines)
 
 
 def xml_comment(lines: Iterable[str]) -> str:
-    """Lines as a comment of XML, which has no two hyphens in one, and holds no control characters."""
+    """Format lines as an XML comment, which cannot contain two adjacent hyphens or control characters."""
     return f"<!--\n{re.sub('-(?=-)', '- ', comment_lines(lines))}-->\n"
 
 
 def xml_attribute(text: str) -> str:
-    """Text as it stands between an attribute's double quotes."""
+    """Escape a text for an attribute's double quotes."""
     return escape(plain(text), quote=False).replace('"', "&quot;")
 
 
 def blocks(numbers: NDArray, separator: str = " ") -> str:
-    """A list of numbers, `NUMBERS_PER_LINE` in a line."""
+    """Format a list of numbers, `NUMBERS_PER_LINE` per line."""
     texts = list(map(repr, numbers.tolist()))
     starts = range(0, len(texts), NUMBERS_PER_LINE)
     return "".join(f"{separator.join(texts[start : start + NUMBERS_PER_LINE])}\n" for start in starts)

@@ -1,4 +1,4 @@
-"""What all readers of images share: which volume of several, and in words what is wrong with a file."""
+"""Shared code of image readers: choice of a volume, and messages about damaged files."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.system.budget import check_memory
 
-IMAGE_BYTES = 8  # of a voxel of an `Image`, at most
-# What to do about a file that ends too soon, and about one that may never have been an image.
+IMAGE_BYTES = 8  # per voxel of an `Image`, at most
+# Messages for a file that ends too soon, and for one that may not be an image.
 DAMAGED_FILE = "the file is truncated or damaged; copy it again"
-TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
-TOO_LONG = f"{DAMAGED_FILE} (it goes on far behind the last voxel, beyond byte {{}})"
+TRAILING_BYTES = 2**24  # 17 MB after the last voxel: MGH's tags
+TOO_LONG = f"{DAMAGED_FILE} (it continues far after the last voxel, beyond byte {{}})"
 UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 
 
 class VoxelsInFile:
-    """Three axes of an array in a file, whose other axes stay at an index each; boxes are read by slices.
+    """Three axes of an array in a file, with fixed indices on its other axes; boxes are read by slicing.
 
     Parameters
     ----------
     path : Path
-        What messages name.
+        Path for messages.
     array : Any
-        Gives an array of numpy for a tuple of slices and indices, one for each of its axes.
+        Returns a numpy array for a tuple of slices and indices, one for each of its axes.
     picks : tuple
-        Of each axis of the array an index, or the slice (start, stop) of it that is one of the three.
+        For each axis of the array an index, or for the three axes a slice (start, stop).
     chunks : tuple of int, optional
-        Edges, along all axes of the array, of what is read at once at the least.
+        Edges, along all axes of the array, of the smallest block that is read at once.
     """
 
     def __init__(
@@ -47,14 +47,14 @@ class VoxelsInFile:
 
     @property
     def strides(self) -> tuple[int, ...] | None:
-        """Bytes from voxel to voxel along each axis of a mapped file, where the first runs fastest; None of chunks."""
+        """Bytes between voxels along each axis of a mapped file, in which the first varies fastest; None for chunks."""
         if self.chunks is not None:
             return None
         steps = np.cumprod([np.dtype(self.dtype).itemsize, *self.array.shape[:-1]])
         return tuple(int(step) for step, pick in zip(steps, self.picks, strict=True) if isinstance(pick, slice))
 
     def within(self, ranges: Sequence[tuple[int, int]]) -> VoxelsInFile:
-        """The voxels in a box of indices, start to before stop along each of the three axes."""
+        """Return the voxels in a box of indices, start (inclusive) to stop (exclusive) along the three axes."""
         bounds = iter(ranges)
         picks = []
         for pick in self.picks:
@@ -67,7 +67,7 @@ class VoxelsInFile:
         return part
 
     def __getitem__(self, box: tuple[slice, ...]) -> NDArray:
-        """The voxels of a box of indices, in memory; InputError where the file has none that can be read."""
+        """Read the voxels of a box of indices into memory; InputError if they cannot be read."""
         ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
         picks = self.within(ranges).picks
         try:
@@ -75,7 +75,7 @@ class VoxelsInFile:
             return np.array(values) if isinstance(values, np.memmap) else np.asarray(values)
         except MemoryError:
             raise
-        except Exception as error:  # whatever a codec raises at a damaged chunk
+        except Exception as error:  # codecs raise any error on damaged chunks
             place = ", ".join(f"{start}:{stop}" for start, stop in ranges)
             raise InputError(
                 f"{self.path}: its voxels {place} cannot be read ({one_line(error)[:200]}); copy it again"
@@ -83,33 +83,33 @@ class VoxelsInFile:
 
 
 def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:
-    """Index into the axes beyond the third (or beyond a picture's two) of the volume asked for.
+    """Return the index into the axes beyond the third (or beyond a picture's two) for the requested volume.
 
-    `axes` has their names and lengths, where they have names.
+    `axes` lists their names and lengths, if they have names.
     """
     axes = f" along {axes}" if axes else ""
     count = math.prod(int(size) for size in trailing)
     if count <= 0:
-        raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
+        raise InputError(f"expected voxels along every axis, got trailing axes of lengths {trailing}")
     if volume is None and count > 1:
         raise InputError(
-            f"the file holds {count} volumes{axes}; choose one, 0 to {count - 1}: `volume=k`, "
+            f"the file has {count} volumes{axes}; choose one from 0 to {count - 1}: `volume=k`, "
             "`volume` K for the first image of a command, FILE:K for others"
         )
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
         volumes = "one volume" if count == 1 else f"{count} volumes{axes}"
-        raise InputError(f"volume {volume} asked for, but the file holds {volumes}; choose from 0 to {count - 1}")
+        raise InputError(f"expected a volume from 0 to {count - 1}, got {volume}: the file has {volumes}")
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
 def check_room(sizes: Sequence[int], value_bytes: int, remedy: str = "crop or resample it first") -> None:
-    """InputError if one volume, of its first three axes, does not fit memory, as it is read and as an `Image`."""
+    """Raise InputError if one volume, the first three axes, does not fit into memory, as read and as an `Image`."""
     count = math.prod(sizes[:3])
     shape = " x ".join(str(size) for size in sizes[:3])
     check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", remedy)
 
 
 def one_line(words: object) -> str:
-    """Text of a library on one line."""
+    """Format a library's text on one line."""
     return " ".join(str(words).split())

@@ -1,20 +1,20 @@
-"""Meshes and models as VTK's files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
+"""Meshes and models as VTK files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
-What they hold is in `tetopt.io.vtkhdf`, too.
+`tetopt.io.vtkhdf` writes the same contents.
 
-Points in world mm, cells positively oriented, of one type: linear, or quadratic with straight edges, whose corners come
-first among the points. What is on each cell is cell data, on each point point data; with materials there is cell data
-`young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3; of moduli that vary in a cell also
-`young_gauss`, a column for each Gauss point of quadratic cells, or point data `young_nodes`. Texts are field data, held
-as bytes of UTF-8: meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are
-the words of `loads`.
+Points are in world mm; cells are positively oriented and of one type: linear, or quadratic with straight edges, with
+corners first among the points. Data of cells and points are cell data and point data. Materials are cell data `young`,
+`nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell data
+`young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Texts are field data,
+as UTF-8 bytes: meshio refuses files with VTK's string arrays, and pyvista writes only ASCII to them. `loads` contains
+loads in text form.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
-0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data
-when they change the cells: "cells_sha256" beside them tells the cells that the sets were written for.
+0, for ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data when they
+change the cells: "cells_sha256" identifies the cells for which the sets were written.
 
-3D Slicer (`vtkMRMLModelStorageNode`) takes coordinates for LPS unless the head of a .vtk file says "SPACE=RAS", as ours
-does, or a .vtu file has a string array SPACE, which ours cannot have: take .vtk there, or LPS.
+3D Slicer (`vtkMRMLModelStorageNode`) assumes LPS coordinates unless the header of a .vtk file has "SPACE=RAS", as
+tetopt's files do, or a .vtu file has a string array SPACE, which tetopt's cannot have: use .vtk there, or LPS.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ from tetopt.system.incoming import json_of
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkUnstructuredGrid
 
-VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf")  # of files of ours that hold all of a model, and are read
-# Names of field data in our files, see above.
+VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf")  # formats that contain a whole model and can be read back
+# Names of field data in tetopt's files, see above.
 FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
-COMPRESSION_LEVEL = 2  # zlib's level: files are 3 % larger than by VTK's own, 5, and written in 0.4 of the time
-LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
+COMPRESSION_LEVEL = 2  # of zlib: files are 3 % larger than with VTK's default, 5, and written in 0.4 of the time
+LEGACY_VERSION = 42  # version 4.2: older programs, including 3D Slicer, cannot read 5.1
 
 
 def vtu(model: Model) -> bytes:
-    """A VTU file, exact, compressed."""
+    """Return a VTU file, exact and compressed."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     return xml_bytes(vtkXMLUnstructuredGridWriter(), model_grid(model))
 
 
 def vtk(model: Model) -> bytes:
-    """A legacy VTK file, binary, since VTK rounds ASCII to eleven digits."""
+    """Return a legacy VTK file; binary, because VTK rounds ASCII to eleven digits."""
     import pyvista
     from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
 
@@ -71,10 +71,10 @@ def vtk(model: Model) -> bytes:
 
 
 def _without_int64(values: NDArray) -> NDArray:
-    """Integers of 64 bits as ones of 32, or as floats if they do not fit.
+    """Convert 64-bit integers to 32 bits, or to floats if they do not fit.
 
-    VTK writes them as "long", which is not the same everywhere, or, when they are a "long long" (as those that it has
-    read from a VTU file are), as "vtktypeint64", which meshio does not know.
+    VTK writes them as "long", whose size depends on the platform, or, if they are a "long long" (e.g. from a VTU file),
+    as "vtktypeint64", which meshio does not know.
     """
     if values.dtype.kind not in "iu" or values.dtype.itemsize < 8:
         return values
@@ -84,25 +84,25 @@ def _without_int64(values: NDArray) -> NDArray:
 
 
 def xml_bytes(writer: Any, grid: vtkDataSet) -> bytes:
-    """A grid as what one of VTK's XML writers makes of it, whose arrays take the names that stand in the file."""
+    """Return the output of a VTK XML writer for a grid, with escaped names of arrays."""
     for fields in (grid.GetCellData(), grid.GetPointData(), grid.GetFieldData()):
         for number in range(fields.GetNumberOfArrays()):
             array = fields.GetAbstractArray(number)
-            array.SetName(name_in_xml(array.GetName()))  # VTK 9.7 writes them as they are
+            array.SetName(name_in_xml(array.GetName()))  # VTK 9.7 does not escape them
     writer.SetCompressionLevel(COMPRESSION_LEVEL)
     writer.SetDataModeToBinary()
     return written_bytes(writer, grid)
 
 
 def name_in_xml(name: str) -> str:
-    """A name as it stands in a file of VTK's: `tetopt.io.read_vtk` takes counts between apostrophes for the file's."""
+    """Escape a name for VTK's XML files; apostrophes, too, as `tetopt.io.read_vtk` checks counts between them."""
     return xml_attribute(name).replace("'", "&apos;")
 
 
 def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
-    """What one of VTK's writers makes of a grid.
+    """Return the output of a VTK writer for a grid.
 
-    VTK writes into memory and Python to the disk: on a full one VTK reports nothing, or ends the process.
+    VTK writes to memory and Python to the disk: on a full disk, VTK reports nothing or ends the process.
     """
     writer.SetInputData(grid)
     writer.WriteToOutputStringOn()
@@ -110,12 +110,12 @@ def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
         raise RuntimeError("VTK could not write the mesh")
     if writer.IsA("vtkXMLWriter"):
         return writer.GetOutputString().encode()
-    text = writer.GetOutputStdString()  # bytes, if they are no text
+    text = writer.GetOutputStdString()  # bytes if it is not text
     return text if isinstance(text, bytes) else text.encode()
 
 
 def model_grid(model: Model) -> vtkUnstructuredGrid:
-    """All of a model on one grid."""
+    """Convert a whole model to one grid."""
     on_cells, on_nodes = grid_fields(model)
     grid = vtk_grid(*elements(model), VTK_KINDS[model.mesh.ndim, model.order], on_cells, on_nodes)
     texts = dict(model.about) | {"space": model.space}
@@ -131,14 +131,14 @@ def model_grid(model: Model) -> vtkUnstructuredGrid:
 
 
 def add_texts(grid: vtkUnstructuredGrid, texts: dict[str, Any]) -> None:
-    """Each entry as field data, as JSON unless it is a string already."""
+    """Add each entry as field data, as JSON unless it is a string already."""
     for name, value in texts.items():
         text = value if isinstance(value, str) else json.dumps(value)
         add_array(grid.GetFieldData(), name, np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8))
 
 
 def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
-    """The sets as field data, with the checksum of the cells that they are of."""
+    """Add the sets as field data, with the checksum of their cells."""
     for name, rows in sets.facets.items():
         add_array(grid.GetFieldData(), f"{FACETS_PREFIX}{name}", rows)
     for name, members in sets.cells.items():
@@ -148,13 +148,13 @@ def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
 
 
 def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
-    """The sets among a file's field data, if they were written for these cells; and what is left out, in words."""
+    """Return the sets in a file's field data, if they were written for these cells, and notes on dropped ones."""
     names = [name for name in field_data if name.startswith((FACETS_PREFIX, CELLS_PREFIX))]
     sets = Sets({}, {})
     if not names:
         return sets, ()
     if text_in(field_data, CHECKSUM_NAME) != _checksum(mesh):
-        words = "sets left out, as the file does not tell that its cells are still those that they were written for"
+        words = "dropped sets, as the cells may have changed since the sets were written"
         return sets, (f"{words}: {', '.join(name.partition(':')[2] for name in names)}",)
     unfit = []
     for key in names:
@@ -167,12 +167,12 @@ def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str
             sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
         else:
             sets.cells[name] = field_data[key].ravel().astype(np.int64)
-    words = "sets left out, as they are no ascending cells or facets, or have no name of their own"
+    words = "dropped sets that are not ascending cells or facets, or have no unique name"
     return sets, (f"{words}: {', '.join(unfit)}",) if unfit else ()
 
 
 def _is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
-    """Whether these are rows of integers from 0 up to `ends`, ascending."""
+    """Return whether values are ascending rows of integers from 0 to below `ends`."""
     try:
         numbers = np.ravel_multi_index(tuple(values.reshape(-1, len(ends)).T), ends)
     except (TypeError, ValueError):
@@ -185,11 +185,11 @@ def _checksum(mesh: Mesh) -> str:
 
 
 def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
-    """The box of the image that a mesh of so many dimensions was made from, if its file tells."""
+    """Return the box of the meshed image from a file's field data, if present and valid."""
     try:
         box = json_of(text_in(field_data, "box") or "")
         shape = tuple(box["shape"])
-        affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine  # which checks it
+        affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine  # checked by Image
     except (TypeError, ValueError, KeyError, OverflowError, RecursionError):  # another program's "box"
         return None
     is_shape = len(shape) == ndim and all(type(size) is int and size > 0 for size in shape)

@@ -1,10 +1,10 @@
-"""XDMF for FEniCSx (dolfinx), ParaView and meshio: one file of text with the mesh, its moduli and tags of its sets.
+"""XDMF for FEniCSx (dolfinx), ParaView and meshio: one text file with the mesh, its moduli and tags of its sets.
 
-The domain has one grid, "mesh", as meshio wants it, with what is on each cell, first `material` from 1, then `young`
-and `nu`. An <Information> in it holds the others: "facets" and "cells", if there are such sets, with one integer for
-each facet or cell that is in any set. A tag stands for one combination of sets, so a set is several tags:
-<Information Name="superior" Value="2 5"> in the grid names them. The tag of a cell is its label, or another number if
-sets divide the label (`tetopt.io.tags.numbered_parts`). This reads all of it, on any number of processes::
+The domain has one grid, "mesh", as meshio requires, with cell data: first `material` (from 1), then `young` and `nu`.
+An <Information> in it contains the other grids: "facets" and "cells", if there are such sets, with one integer for each
+facet or cell in any set. A tag represents one combination of sets, so that a set has several tags:
+<Information Name="superior" Value="2 5"> in the grid lists them. The tag of a cell is its label, or another number if
+sets divide the label (`tetopt.io.tags.numbered_parts`). This program reads all data, on any number of processes::
 
     from xml.etree import ElementTree
 
@@ -24,7 +24,7 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This reads all of it, o
 
     root = ElementTree.parse("model.xdmf").getroot()
 
-    def members(tags, grid, name):  # facets or cells of a set, as dolfinx numbers them
+    def members(tags, grid, name):  # facets or cells of a set, in dolfinx's numbering
         of_set = root.find(f".//Grid[@Name='{grid}']/Information[@Name='{name}']").get("Value")
         return tags.indices[np.isin(tags.values, np.array(of_set.split(), dtype=int))]
 
@@ -37,16 +37,16 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This reads all of it, o
     young, nu = on_cells("young"), on_cells("nu")
     superior = members(facet_tags, "facets", "superior")
 
-Before 0.7 `fem.functionspace` was `fem.FunctionSpace`; with that, 0.5.2 runs it, too. `read_meshtags` takes the first
-attribute of a grid, which `material` is for that reason. The encoding must be given, or dolfinx looks for an HDF5 file
-beside this one. It reads no floating point numbers of cells from XDMF, hence the parsing. Quadratic elements are chosen
-there, on cells of either order: a file of order 2 has the nodes of order 2, too, of cells that dolfinx integrates as
-curved ones, which those on interfaces may be.
+Before 0.7, `fem.functionspace` was `fem.FunctionSpace`; with this change the program also runs with 0.5.2.
+`read_meshtags` uses the first attribute of a grid, which is why `material` comes first. The encoding must be given;
+otherwise dolfinx looks for an HDF5 file beside this one. dolfinx cannot read floating-point cell data from XDMF, hence
+the parsing. Quadratic elements are chosen in dolfinx, on cells of either order: a file of order 2 also has the nodes of
+order 2, and dolfinx integrates its cells as curved, as those on interfaces may be.
 
-In the grid "mesh" <Information Name="young"> and <Information Name="nu"> list what the materials 1, 2, ... have,
-<Information Name="load" Value="hold:superior"> is a load in the words of `tetopt.model.loads`, and
-<Information Name="about"> says where the file comes from, in what coordinates and units. With a test function `v` of a
-space `V` of vectors, on from the program above, this applies the loads of step 1::
+In the grid "mesh", <Information Name="young"> and <Information Name="nu"> list the constants of materials 1, 2, ...,
+<Information Name="load" Value="hold:superior"> is a load in the text form of `tetopt.model.loads`, and
+<Information Name="about"> describes the origin of the file, its coordinates and its units. With a test function `v` of
+a vector space `V`, the following continues the program above and applies the loads of step 1::
 
     import ufl
 
@@ -74,14 +74,14 @@ space `V` of vectors, on from the program above, this applies the loads of step 
             forces.append(-numbers[0] * ufl.inner(normal, v) * on_set)
         elif kind == "traction":
             forces.append(ufl.inner(fem.Constant(mesh, numbers), v) * on_set)
-        else:  # a spring: what is assembled of these goes onto the matrix's diagonal
+        else:  # a spring: its assembled vector is added to the diagonal of the matrix
             springs.append(numbers[0] * ufl.inner(fem.Constant(mesh, np.ones(dim)), v) * on_set)
 
 Moduli that are linear within cells are the attribute `young_nodes`, one for each node.
 
-VTK, and with it pyvista and ParaView, follows the grid's Reference to a tree of the same grids, which it reads as
-blocks, as long as no list is longer than 10 MB, which that of the cells is from some 400 000 tetrahedra on: use .vtu
-for those. meshio ignores the Reference and reads the mesh and its data, without the sets.
+VTK, and thus pyvista and ParaView, follows the grid's Reference to a tree of the same grids, which it reads as blocks,
+if no list exceeds 10 MB, as that of the cells does from about 400 000 tetrahedra on: use .vtu for larger meshes. meshio
+ignores the Reference and reads the mesh and its data, without sets.
 """
 
 from __future__ import annotations
@@ -98,29 +98,29 @@ from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described, element_facets, elements
 from tetopt.model.sets import Sets
 
-# By dimension and order; lines need their number of nodes stated. VTK's order of nodes.
+# By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
     (1, 1): '"PolyLine" NodesPerElement="2"', (2, 1): '"Triangle"', (3, 1): '"Tetrahedron"',
     (1, 2): '"Edge_3"', (2, 2): '"Triangle_6"', (3, 2): '"Tetrahedron_10"',
 }  # fmt: skip
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
 TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
-TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without, meshio 5.3.5 none with it
-INFORMATION_TEXT = "&lt;main/&gt;"  # meshio takes an Information's text for XML
+TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 refuses it
+INFORMATION_TEXT = "&lt;main/&gt;"  # meshio parses an Information's text as XML
 
 
 def xdmf(model: Model) -> bytes:
-    """The bytes of an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
+    """Return an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
 
-    A facet is listed once, its nodes facing out of the cell that the first of its sets holds it by; where a set holds
-    it by the other one, its tag is also in <Information Name="NAME turned"/>. dolfinx itself gives facets no side.
-    Cell data of 3 columns is written as vectors, of other numbers of columns as that many fields NAME_0, NAME_1, ...;
-    materials replace cell data of the names material, young, nu and density.
+    A facet is listed once, oriented outwards from its cell in the first of its sets; if another set holds it from the
+    other side, its tag is also in <Information Name="NAME turned"/>. dolfinx itself does not orient facets. Cell data
+    with 3 columns are written as vectors, with other numbers of columns as separate fields NAME_0, NAME_1, ...;
+    materials replace cell data with the names material, young, nu and density.
 
     Raises
     ------
     InputError
-        Data of cells or points that is not finite, since VTK stops reading there and makes up the rest.
+        Data of cells or points are not finite: VTK would stop reading there and invent the rest.
     """
     _check(model)
     grids = []
@@ -138,12 +138,12 @@ def _check(model: Model) -> None:
     for what, data in (("cell", model.cell_data), ("point", model.point_data)):
         for name, values in data.items():
             if bad := int((~np.isfinite(values)).sum()):
-                words = f'got {bad} values of "{name}" that are not; take .vtu'
+                words = f'got {bad} invalid values of "{name}"; use .vtu'
                 raise InputError(f"xdmf: expected finite {what} data, {words}")
 
 
 def _mesh_grid(model: Model, others: str) -> str:
-    """The domain's grid, with the tree of all grids that VTK reads instead: itself by references, and `others`."""
+    """Return the domain's grid, with the tree of grids that VTK reads instead: itself by references, and `others`."""
     fields = model.cell_data
     named = [("about", line) for line in described(model)] + [("load", load_words(load)) for load in model.loads]
     if model.materials is not None:
@@ -173,12 +173,12 @@ def _mesh_grid(model: Model, others: str) -> str:
 
 
 def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Fields as VTK takes them for what they are: scalars and vectors, no matrices."""
+    """Convert fields to forms that VTK recognises: scalars and vectors, no matrices."""
     return as_columns(fields, shapes=((3,),))
 
 
 def _cell_grid(model: Model) -> str:
-    """The cells that are in any set; where they have labels, a tag is the label."""
+    """Return the grid of cells in sets; if they have labels, a tag is the label."""
     combined = tagged(model.sets.cells)
     if group_labels(model) is not None:
         part, _ = numbered_parts(model._replace(materials=None, sets=Sets({}, model.sets.cells)))
@@ -190,7 +190,7 @@ def _facet_grid(model: Model) -> str:
     sets, of_cell = model.sets.facets, facets(model.mesh.cells).of_cell
     number = {name: of_cell[members[:, 0], members[:, 1]] for name, members in sets.items()}
     numbers, first = np.unique(np.concatenate(list(number.values())), return_index=True)
-    listed = np.concatenate(list(sets.values()))[first]  # the row that each facet is listed by
+    listed = np.concatenate(list(sets.values()))[first]  # the row of each facet
     turned = {
         f"{name} turned": number[name][listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]]
         for name, members in sets.items()
@@ -223,9 +223,9 @@ def _attribute(name: str, values: NDArray, center: str, item: str) -> str:
 
 
 def _reference(part: str) -> str:
-    """The item of a part of the domain's grid.
+    """Return a reference to an item of the domain's grid.
 
-    Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
+    XInclude, as dolfinx writes it, is not used: VTK 9.7 crashes on dolfinx's address for it.
     """
     return f'<DataItem Reference="XML">/Xdmf/Domain/Grid/{part}/DataItem</DataItem>\n'
 

@@ -1,7 +1,7 @@
-"""Chunks of Zarr unpacked to as many bytes as the array tells, no more and no less.
+"""Decompression of Zarr chunks to exactly the number of bytes that the array requires.
 
-Codecs believe what a chunk says of itself: Blosc reads beyond its end, others take any amount of memory. So that sizes
-are looked at here, and streams are unpacked up to what is expected.
+Codecs trust the header of a chunk: Blosc reads beyond its end, others allocate any amount of memory. Therefore sizes
+are checked here, and streams are decompressed only up to the expected size.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-BLOSC_HEADER = struct.Struct("<4B3I")  # versions, flags, size of an item, of all, of a block, of the chunk
+BLOSC_HEADER = struct.Struct("<4B3I")  # versions, flags, size of an item; total, block and chunk sizes
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-LZMA_BYTES = 2**28  # of memory besides that of the voxels: its highest preset takes 65 MB
+LZMA_BYTES = 2**28  # of memory in addition to the voxels: its highest preset takes 65 MB
 PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
 
 
 def unpacked(name: str, packed: bytes, n_bytes: int) -> bytes:
-    """Return what a chunk holds; ValueError where that is damaged or other than `n_bytes` long."""
+    """Return the content of a chunk; ValueError if it is damaged or does not have `n_bytes` bytes."""
     streams: dict[str, Callable[[], Any]] = {
         "gzip": lambda: zlib.decompressobj(zlib.MAX_WBITS | 16),
         "zlib": zlib.decompressobj,
@@ -43,18 +43,18 @@ def unpacked(name: str, packed: bytes, n_bytes: int) -> bytes:
 
         claim = {"blosc": _blosc_bytes, "zstd": _zstd_bytes, "lz4": _lz4_bytes}[name](packed)
         if claim not in (n_bytes, None):
-            raise ValueError(f"a chunk tells of {claim} bytes, the array of {n_bytes}")
+            raise ValueError(f"a chunk announces {claim} bytes, the array {n_bytes}")
         place = np.zeros(n_bytes, np.uint8)
         numcodecs.get_codec({"id": name}).decode(packed, out=place)
         value = place.tobytes()
     if len(value) != n_bytes:
         count = f"more than {n_bytes}" if len(value) > n_bytes else str(len(value))
-        raise ValueError(f"a chunk unpacks to {count} bytes, the array tells of {n_bytes}")
+        raise ValueError(f"a chunk unpacks to {count} bytes, the array announces {n_bytes}")
     return value
 
 
 def _blosc_bytes(packed: bytes) -> int:
-    """What a chunk's header tells, as long as the rest of it can be true: Blosc itself looks at no length."""
+    """Return the size in a chunk's header after checking its other fields: Blosc itself checks no lengths."""
     if len(packed) < BLOSC_HEADER.size:
         raise ValueError("a chunk ends within its Blosc header")
     *_, item, n_bytes, block, length = BLOSC_HEADER.unpack_from(packed)
@@ -64,9 +64,9 @@ def _blosc_bytes(packed: bytes) -> int:
 
 
 def _zstd_bytes(packed: bytes) -> int | None:
-    """What the header of the first frame tells (RFC 8878), if it does."""
+    """Return the size in the header of the first frame (RFC 8878), if given."""
     if packed[:4] != ZSTD_MAGIC or len(packed) < 6:
-        raise ValueError("a chunk is no Zstandard frame")
+        raise ValueError("a chunk is not a Zstandard frame")
     flags = packed[4]
     is_single = flags >> 5 & 1
     begin = 5 + (not is_single) + (0, 1, 2, 4)[flags & 3]
@@ -82,7 +82,7 @@ def _lz4_bytes(packed: bytes) -> int:
 
 
 def bounded(array: Any) -> Any:
-    """Return the same array of zarr's, whose chunks are unpacked by `unpacked`."""
+    """Return the same zarr array, with chunks decompressed by `unpacked`."""
     import zarr
 
     metadata = array.metadata
@@ -90,7 +90,7 @@ def bounded(array: Any) -> Any:
         metadata = replace(metadata, codecs=_bounded_codecs(metadata.codecs))
     elif metadata.compressor is not None:
         item = array.dtype.itemsize
-        for each in metadata.filters or ():  # in the order of packing; some store other numbers than they are given
+        for each in metadata.filters or ():  # in the order of encoding; some change the type of numbers
             config = each.get_config()
             stored = config.get("encode_dtype") or config.get("astype")
             item = np.dtype(stored).itemsize if stored else item
@@ -99,7 +99,7 @@ def bounded(array: Any) -> Any:
 
 
 def _bounded_codecs(codecs: Any) -> tuple[Any, ...]:
-    """Codecs of format 3, those within shards among them."""
+    """Wrap the codecs of format 3, including those within shards."""
     from zarr.codecs import ShardingCodec
 
     changed = []
@@ -119,7 +119,7 @@ def _name_of(codec: Any) -> str:
 
 @cache
 def _classes() -> tuple[Any, Any]:
-    """Codecs for formats 3 and 2; zarr is loaded when it is used."""
+    """Return codec classes for formats 3 and 2; zarr is imported only when used."""
     from numcodecs.abc import Codec
     from zarr.abc.codec import BytesBytesCodec
 
@@ -144,7 +144,7 @@ def _classes() -> tuple[Any, Any]:
             raise NotImplementedError
 
     class BoundedCompressor(Codec):
-        codec_id = "bounded"  # as zarr looks for one in the class
+        codec_id = "bounded"  # zarr looks for it in the class
 
         def __init__(self, inner: Any, n_bytes: int) -> None:
             self.codec_id, self.n_bytes = inner.codec_id, n_bytes

@@ -1,7 +1,7 @@
-"""Zarr arrays and OME-Zarr images, of folders on this machine: what axes, scale and translation say of the voxels.
+"""Zarr arrays and OME-Zarr images in local folders: axes, scales and translations of voxels.
 
-NGFF 0.4 and 0.5 (https://ngff.openmicroscopy.org) tell of axes, units, scales and translations; the order of the
-array's axes in space is kept as that of the indices. Nothing is read of the voxels here; chunks are counted.
+NGFF 0.4 and 0.5 (https://ngff.openmicroscopy.org) define axes, units, scales and translations; indices keep the order
+of the array's spatial axes. Voxels are not read here; chunks are counted.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from tetopt.system.files import folder_written_whole
 from tetopt.system.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 
 ZARR_SUFFIX = ".zarr"
-NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
+NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # every Zarr array and group, of version 3 or 2, has one of these
 METADATA_FILES = (*NODE_FILES, ".zattrs", ".zmetadata")
-MOST_CHUNKS = 2**24  # of one image: as many names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
-MOST_SPARSE = 1000  # chunks to each that is there: an image of nothing would be long work
-# Of a chunk's file: headers of codecs, and for each voxel a number of 8 bytes and what shards and codecs add to it.
+MOST_CHUNKS = 2**24  # in an image: their names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
+MOST_SPARSE = 1000  # chunks per existing chunk: an almost empty image would take long
+# In a chunk's file: headers of codecs, and per voxel a number of 8 bytes and the overhead of shards and codecs.
 PACKED_BYTES, PACKED_VOXEL_BYTES = 2**16, 32
-CHUNK_EDGE = 128  # voxels, of what is written: 4 MB of 16 bits, and a part of a mesh reads a few
-MOST_LEVELS = 64  # of a multiscale: each is at least half of the one before
-# NGFF's units of length, names of UDUNITS-2, in mm.
+CHUNK_EDGE = 128  # voxels, in written files: 4 MB of 16 bits, and a part of a mesh reads a few chunks
+MOST_LEVELS = 64  # in a multiscale: more than halving any volume can give
+# NGFF's units of length, with names of UDUNITS-2, in mm.
 MM_PER_LENGTH = {
     "yoctometer": 1e-21, "zeptometer": 1e-18, "attometer": 1e-15, "femtometer": 1e-12, "picometer": 1e-9,
     "angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "decimeter": 100.0,
@@ -44,13 +44,13 @@ MM_PER_LENGTH = {
     "petameter": 1e18, "exameter": 1e21, "zettameter": 1e24, "yottameter": 1e27, "inch": 25.4, "foot": 304.8,
     "yard": 914.4, "mile": 1609344.0, "parsec": 3.0856775814913674e19,
 }  # fmt: skip
-# Where an axis leads in RAS+, by its orientation (NGFF's RFC-4): row of the affine and sign.
+# Direction of an axis in RAS+, by its orientation (NGFF's RFC-4): row of the affine and sign.
 WAYS_OF_BODY = {
     "left-to-right": (0, 1.0), "right-to-left": (0, -1.0), "posterior-to-anterior": (1, 1.0),
     "anterior-to-posterior": (1, -1.0), "inferior-to-superior": (2, 1.0), "superior-to-inferior": (2, -1.0),
 }  # fmt: skip
-ARRAY_AXES = 32  # of an array, the fewest that a numpy which is supported can have
-# Numbers to as many numbers. Others, such as numcodecs' pickle, can make a file run whatever it likes.
+ARRAY_AXES = 32  # at most in an array, the limit of the oldest supported numpy
+# Codecs from numbers to as many numbers. Others, such as numcodecs' pickle, would let a file run any code.
 KNOWN_CODECS = (
     *PACKERS, "bytes", "endian", "transpose", "sharding_indexed", "crc32c", "shuffle", "delta", "bitround",
     "fixedscaleoffset", "quantize", "astype",
@@ -58,45 +58,45 @@ KNOWN_CODECS = (
 
 
 class ZarrLevel(NamedTuple):
-    """One array of an image and what is known of its place."""
+    """One array of an image, with its placement."""
 
     folder: Path
     array: Any
     names: tuple[str, ...]  # of all axes
-    space: tuple[int, ...]  # which three axes are those of space, in their order
-    affine: NDArray[np.float64]  # (4, 4), of the indices along these three -> world, mm
+    space: tuple[int, ...]  # the three spatial axes, in order
+    affine: NDArray[np.float64]  # (4, 4), from indices along these three axes to world, mm
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of voxels along the three axes in space."""
+        """Number of voxels along the three spatial axes."""
         return tuple(int(self.array.shape[axis]) for axis in self.space)
 
     @property
     def others(self) -> tuple[int, ...]:
-        """The axes that are none of space."""
+        """The axes that are not spatial."""
         return tuple(axis for axis in range(len(self.names)) if axis not in self.space)
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether it is a folder of Zarr's, by its name or by what lies in it."""
+    """Return whether a path is a Zarr folder, by its name or its contents."""
     return path.is_dir() and (path.name.lower().endswith(ZARR_SUFFIX) or is_node(path))
 
 
 def is_node(path: Path) -> bool:
-    """Whether it is an array or a group of Zarr, by what lies in it."""
+    """Return whether a folder is a Zarr array or group, by its contents."""
     return any((path / name).exists() for name in NODE_FILES)
 
 
 def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
-    """One volume of a level, of which nothing is read.
+    """Open one volume of a level, without reading voxels.
 
     Raises
     ------
     InputError
-        Without the path before it: several volumes and no `volume`, or one out of range.
+        Without a leading path: there are several volumes and no `volume`, or it is out of range.
     """
     words = ", ".join(f"{level.names[axis]} ({level.array.shape[axis]})" for axis in level.others)
-    # The last axis runs fastest, as in the file.
+    # The last axis varies fastest, as in the file.
     index = volume_index([level.array.shape[axis] for axis in level.others[::-1]], volume, words)[::-1]
     picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
     for axis, at in zip(level.others, index, strict=True):
@@ -106,13 +106,13 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
-    """The arrays of an image, the finest first: those of OME-Zarr's first multiscale, or one by itself.
+    """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, or a single array.
 
     Raises
     ------
     InputError
-        Without the path before it: zarr is not installed; the folder, or what its metadata tells, is no image in three
-        dimensions with a scale.
+        Without a leading path: zarr is not installed; the folder or its metadata do not describe a 3-D image with a
+        scale.
     """
     node = _node(path)
     if hasattr(node, "shape"):
@@ -122,13 +122,13 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     scales = ome.get("multiscales") if isinstance(ome, dict) else None
     if not isinstance(scales, list) or not scales or not isinstance(scales[0], dict):
         inside = sorted(child.name for child in path.iterdir() if is_node(child))
-        listed = f"; name what is in it: {', '.join(inside[:8])}" if inside else ", and nothing in it"
-        raise InputError(f"a group of Zarr without an OME-Zarr image (multiscales){listed}")
+        listed = f"; choose one of its members: {', '.join(inside[:8])}" if inside else ", and it is empty"
+        raise InputError(f"this Zarr group has no OME-Zarr image (multiscales){listed}")
     datasets, axes = scales[0].get("datasets"), scales[0].get("axes")
     if not isinstance(datasets, list) or not 0 < len(datasets) <= MOST_LEVELS:
         raise _unusable("datasets", datasets, "a list of its arrays")
     if not isinstance(axes, list) or not all(isinstance(axis, dict) for axis in axes):
-        raise _unusable("axes", axes, "a list of axes with names, as NGFF 0.4 and 0.5 have it")
+        raise _unusable("axes", axes, "a list of axes with names, as in NGFF 0.4 and 0.5")
     after = scales[0].get("coordinateTransformations", [])
     places = _Places(axes)
     levels = [_level(path, each, after, axes, places) for each in datasets]
@@ -136,7 +136,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     if own is None:
         notes += places.notes
         return levels
-    # NGFF 0.5 knows no rotations: the levels are where the first one's own attribute puts them.
+    # NGFF 0.5 has no rotations: the attribute of the first level places all levels.
     turn = own @ np.linalg.inv(levels[0].affine)
     return [levels[0]._replace(affine=own), *(each._replace(affine=turn @ each.affine) for each in levels[1:])]
 
@@ -145,34 +145,34 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
 
     Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of a voxel's edges and
-    the first voxel's place, which NGFF has no more than; the attribute "affine" of the array has it all.
+    the position of the first voxel, which is all that NGFF supports; the attribute "affine" has the whole affine.
 
     Parameters
     ----------
     path : Path
-        Replaces a folder of Zarr's that is there; ask `tetopt.system.files.checked_output` first.
+        Replaces an existing Zarr folder; call `tetopt.system.files.checked_output` first.
     image : Image
-        Whose place they have, three-dimensional.
+        Gives the placement; three-dimensional.
     voxels : Any
-        What gives them for a tuple of slices, chunk after chunk.
+        Returns voxels for a tuple of slices, chunk by chunk.
     dtype : dtype
-        That they are stored in; rounded to whole numbers if it is of these.
+        Type for storage; values are rounded for an integer type.
 
     Returns
     -------
     tuple of float
-        The least value and the largest.
+        The smallest and the largest value.
 
     Raises
     ------
     InputError
-        zarr is not installed; not three axes; values beyond the dtype's.
+        zarr is not installed; the image is not 3-D; values exceed the range of the dtype.
     OSError
-        As `tetopt.system.files.folder_written_whole`.
+        For the reasons of `tetopt.system.files.folder_written_whole`.
     """
     zarr = _library()
     if image.ndim != 3:
-        raise InputError(f"{path}: expected a volume to write as Zarr, got a {image.ndim}-D image; write it as .nii.gz")
+        raise InputError(f"{path}: expected a 3-D image for Zarr, got a {image.ndim}-D one; use .nii.gz")
     low, high = np.inf, -np.inf
     with folder_written_whole(path) as folder:
         group = zarr.open_group(folder, mode="w", zarr_format=3)
@@ -192,20 +192,20 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
 
 
 def _stored_values(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
-    """Values as they are stored; InputError where they do not fit."""
+    """Convert values for storage; InputError if they do not fit."""
     if dtype.kind not in "iu":
         return block.astype(dtype)
     block, limits = np.rint(block), np.iinfo(dtype)
     if block.min() < limits.min or block.max() > limits.max:
         raise InputError(
-            f"{path}: expected values from {limits.min} to {limits.max}, as {dtype} holds them, got {block.min():g} to "
+            f"{path}: expected values from {limits.min} to {limits.max} for {dtype}, got {block.min():g} to "
             f"{block.max():g}; scale them"
         )
     return block.astype(dtype)
 
 
 def _multiscale(image: Image) -> dict[str, Any]:
-    """NGFF's words for one array of voxels."""
+    """Return NGFF's multiscale metadata for one array of voxels."""
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
     transforms = [
         {"type": "scale", "scale": image.spacing.tolist()},
@@ -219,12 +219,12 @@ def _library() -> Any:
         import zarr
         import zarr.storage
     except ImportError as error:
-        raise InputError(f"a folder of Zarr needs the zarr library; {install_hint('blocks', 'zarr')}") from error
+        raise InputError(f"Zarr folders need the zarr library; {install_hint('blocks', 'zarr')}") from error
     return zarr
 
 
 def _level(path: Path, dataset: Any, after: Any, axes: list[dict], places: _Places) -> ZarrLevel:
-    """One dataset of a multiscale."""
+    """Return one dataset of a multiscale."""
     name = dataset.get("path") if isinstance(dataset, dict) else None
     if not isinstance(name, str):
         raise _unusable("path", name, "the name of an array within the folder")
@@ -233,26 +233,26 @@ def _level(path: Path, dataset: Any, after: Any, axes: list[dict], places: _Plac
         raise _unusable("path", name, "the name of an array within the folder")
     folder = path.joinpath(*parts)
     if not is_node(folder):
-        raise InputError(f'{DAMAGED_FILE} (its array "{plain(name)}" is not there)')
+        raise InputError(f'{DAMAGED_FILE} (its array "{plain(name)}" is missing)')
     array = _node(folder)
     if not hasattr(array, "shape"):
         raise _unusable("path", name, "the name of an array")
     if len(array.shape) != len(axes):
-        raise InputError(f"its metadata names {len(axes)} axes, its array has {len(array.shape)}; mend the metadata")
+        raise InputError(f"its metadata has {len(axes)} axes, its array {len(array.shape)}; correct the metadata")
     _check_array(array)
     scale, shift = _scale_and_shift([dataset.get("coordinateTransformations"), after], len(axes))
     return ZarrLevel(folder, array, places.names, places.space, places.affine(scale, shift))
 
 
 def _single(path: Path, array: Any) -> ZarrLevel:
-    """An array by itself, whose first three axes are those of space."""
+    """Return a single array, whose first three axes are spatial."""
     if len(array.shape) < 3:
-        raise InputError(f"expected an array of three axes, got shape {array.shape}; stacks of slices have three")
+        raise InputError(f"expected an array with three axes, got shape {array.shape}")
     _check_array(array)
     affine = _own_affine(array)
     if affine is None:
         raise InputError(
-            "an array of Zarr without a scale; name the folder of the OME-Zarr image that it is of, or give it the "
+            "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it the "
             'attribute "affine", 4 x 4 numbers from index to world in mm'
         )
     names = tuple(f"axis {axis}" for axis in range(len(array.shape)))
@@ -260,51 +260,53 @@ def _single(path: Path, array: Any) -> ZarrLevel:
 
 
 def _own_affine(array: Any) -> NDArray[np.float64] | None:
-    """What the attribute "affine" of an array says, (4, 4), of its axes in space in their order."""
+    """Return the attribute "affine" of an array, (4, 4), for its spatial axes in order."""
     affine = array.attrs.asdict().get("affine")
     return None if affine is None else checked_affine(affine, 3)
 
 
 def _node(path: Path) -> Any:
-    """The array or group in a folder, as zarr reads it."""
+    """Open the array or group in a folder with zarr."""
     zarr = _library()
     for name in METADATA_FILES:
         file = path / name
         if file.exists() and ((other := irregular(file)) is not None or file.stat().st_size > TEXT_BYTES):
-            raise InputError(f"its {name} is {other or 'longer than any'}; expected a text of JSON")
+            raise InputError(f"its {name} is {other or 'too long'}; expected JSON text")
     if not is_node(path):
-        raise InputError(f"no array of Zarr in this folder: it has none of {', '.join(NODE_FILES)}")
+        raise InputError(f"no Zarr array in this folder: expected one of {', '.join(NODE_FILES)}")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what else lies in the folder
+            warnings.simplefilter("ignore")  # about other files in the folder
+            # From 3.4 on zarr reads chunks of no voxels as chunks of one, with a warning.
+            warnings.filterwarnings("error", message="(?s).*stored chunk shape .* is invalid")
             return zarr.open(zarr.storage.LocalStore(path, read_only=True), mode="r", use_consolidated=False)
-    except Exception as error:  # zarr raises whatever comes up at damaged metadata; a codec that is missing is named
+    except Exception as error:  # zarr raises any error on damaged metadata; a missing codec is named
         raise InputError(f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again") from error
 
 
 def _check_array(array: Any) -> None:
-    """InputError for values that are no numbers, no voxels, codecs that are not read and chunks beyond memory."""
+    """Raise InputError for values that are not numbers, no voxels, unsupported codecs and chunks larger than memory."""
     dtype = array.dtype
     if getattr(dtype, "kind", "") not in tuple("buif") or dtype.names is not None:
-        raise InputError(f"expected one real number a voxel, got {plain(str(dtype))}; convert it first")
+        raise InputError(f"expected one real number per voxel, got {plain(str(dtype))}; convert it first")
     if len(array.shape) > ARRAY_AXES:
         raise InputError(f"expected at most {ARRAY_AXES} axes, got {len(array.shape)}; write it again with fewer")
     if 0 in (*array.shape, *array.chunks, *(array.shards or ())):
-        raise InputError(f"every axis needs a voxel, got shape {array.shape} in chunks of {array.chunks}")
+        raise InputError(f"expected voxels along every axis, got shape {array.shape} in chunks of {array.chunks}")
     names = _codec_names(array.metadata.to_dict())
     unknown = sorted({name for name in names if name not in KNOWN_CODECS})
     if unknown:
-        raise InputError(f"its chunks are packed by {plain(', '.join(unknown))}, which is not read; write it again")
+        raise InputError(f"unsupported codecs in its chunks: {plain(', '.join(unknown))}; write it again with others")
     packers = [name for name in names if name in PACKERS]
     if len(packers) > 1:
-        raise InputError(f"its chunks are packed several times, by {', '.join(packers)}; write it again")
+        raise InputError(f"its chunks are compressed several times, by {', '.join(packers)}; write it again")
     shape = " x ".join(str(size) for size in array.chunks)
     n_bytes = math.prod(array.chunks) * dtype.itemsize
-    check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again in smaller ones")
+    check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again with smaller chunks")
 
 
 def _codec_names(metadata: Any) -> list[str]:
-    """Names of all that packs the chunks, those within shards among them, without the library's before them."""
+    """Return the names of all codecs of chunks, including those within shards, without the library's prefix."""
     names = []
     for key in ("compressor", "filters", "codecs", "index_codecs"):
         each = metadata.get(key) or ()
@@ -317,15 +319,15 @@ def _codec_names(metadata: Any) -> list[str]:
 
 
 def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
-    """Look whether the files of the chunks that these voxels are in are there, and are files.
+    """Check that the chunks of these voxels exist and are regular files.
 
-    Writers leave out chunks of nothing but the fill value, so that some that are missing are no error, but one of the
-    `notes`; all are.
+    Writers omit chunks that contain only the fill value; therefore some missing chunks only add to `notes`, but if all
+    are missing it is an error.
 
     Raises
     ------
     InputError
-        Without the path before it: chunks that cannot be.
+        Without a leading path: the chunks are invalid.
     """
     array = voxels.array
     edges = array.shards or array.chunks
@@ -336,7 +338,7 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
     most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
     n_chunks, n_missing = math.prod(map(len, ranges)), 0
     if n_chunks > MOST_CHUNKS:
-        raise InputError(f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again in larger ones")
+        raise InputError(f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again with larger chunks")
     folder = str(voxels.path)
     for place in itertools.product(*ranges):
         name = array.metadata.encode_chunk_key(place)
@@ -346,30 +348,28 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
             n_missing += 1
             continue
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"its chunk {name} is no regular file; copy what it gives into a file")
+            raise InputError(f"its chunk {name} is not a regular file; copy its data into a file")
         if status.st_size > most_bytes:
-            raise InputError(f"its chunk {name} has {status.st_size} bytes, at most {most_bytes} can be; copy it again")
+            raise InputError(f"its chunk {name} has {status.st_size} bytes, not at most {most_bytes}; copy it again")
     if n_missing == 0:
         return
     if n_missing == n_chunks:
-        raise InputError(f"none of its {n_chunks} chunks is there; copy it again, with all that is in its folder")
+        raise InputError(f"all of its {n_chunks} chunks are missing; copy it again, with its whole folder")
     if n_chunks > MOST_SPARSE * (n_chunks - n_missing):
         raise InputError(
-            f"only {n_chunks - n_missing} of its {n_chunks} chunks are there; copy it again, or crop it to them"
+            f"only {n_chunks - n_missing} of its {n_chunks} chunks exist; copy it again, or crop it to them"
         )
     fill = array.fill_value
     if fill is None or not np.isfinite(fill):
-        raise InputError(
-            f"{n_missing} of its {n_chunks} chunks are missing, and it has no value for them; copy it again"
-        )
+        raise InputError(f"{n_missing} of its {n_chunks} chunks are missing, and it has no fill value; copy it again")
     notes.append(
-        f"{n_missing} of its {n_chunks} chunks are not there, and their voxels are taken as {fill:g}, its fill value; "
+        f"{n_missing} of its {n_chunks} chunks are missing; their voxels get its fill value, {fill:g}; "
         "copy it again if it should have values there"
     )
 
 
 class _Places:
-    """What a multiscale's axes say: which are those of space, and where they lead."""
+    """The spatial axes of a multiscale, with their directions and units."""
 
     def __init__(self, axes: list[dict]) -> None:
         self.notes: list[str] = []
@@ -378,8 +378,8 @@ class _Places:
         self.space = tuple(number for number, kind in enumerate(kinds) if kind == "space")
         if len(self.space) != 3:
             raise InputError(
-                f"expected three axes in space, got {len(self.space)} of axes {', '.join(self.names)}; only volumes "
-                "are meshed from Zarr"
+                f"expected three spatial axes, got {len(self.space)} among {', '.join(self.names)}; only 3-D Zarr "
+                "images are supported"
             )
         inside = [axes[number] for number in self.space]
         self.mm = [_mm_of(axis, self.notes) for axis in inside]
@@ -391,14 +391,14 @@ class _Places:
                 raise _unusable("names of axes", ", ".join(letters), "x, y and z, or axes with an orientation")
             self.ways = [("xyz".index(letter), 1.0) for letter in letters]
             self.notes.append(
-                "has no orientation: x, y and z of its axes are taken as right, anterior and superior; if left/right "
+                "has no orientation: assuming x, y and z are right, anterior and superior; if left/right "
                 "matters, give its axes an orientation (NGFF's RFC-4)"
             )
         if len({row for row, _ in self.ways}) < 3:
             raise _unusable("orientation", [_orientation(axis) for axis in inside], "three different directions")
 
     def affine(self, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Index -> world mm, (4, 4), of axes with this scale and translation in their own units."""
+        """Return the affine from index to world mm, (4, 4), for a scale and translation in the units of the axes."""
         affine = np.zeros((4, 4))
         affine[3, 3] = 1.0
         for column, (axis, (row, sign), mm) in enumerate(zip(self.space, self.ways, self.mm, strict=True)):
@@ -408,15 +408,15 @@ class _Places:
 
 
 def _mm_of(axis: dict, notes: list[str]) -> float:
-    """How many mm an axis's unit is."""
+    """Return the length of an axis's unit, mm."""
     unit = axis.get("unit")
     if unit is None:
-        note = "has no unit on its axes: its scale is taken as mm"
+        note = "has no unit on its axes: assuming mm"
         if note not in notes:
             notes.append(note)
         return 1.0
     if not isinstance(unit, str) or unit not in MM_PER_LENGTH:
-        raise _unusable("unit", unit, "a length as NGFF names it, such as micrometer or millimeter")
+        raise _unusable("unit", unit, "one of NGFF's lengths, such as micrometer or millimeter")
     return MM_PER_LENGTH[unit]
 
 
@@ -426,7 +426,7 @@ def _orientation(axis: dict) -> str:
 
 
 def _scale_and_shift(lists: list[Any], n_axes: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What scales and translations, one after the other, come to together."""
+    """Combine successive scales and translations."""
     scale, shift, has_scale = np.ones(n_axes), np.zeros(n_axes), False
     for transforms in lists:
         for each in transforms if isinstance(transforms, list) else []:
@@ -444,7 +444,7 @@ def _scale_and_shift(lists: list[Any], n_axes: int) -> tuple[NDArray[np.float64]
             else:
                 shift = shift + values
     if not has_scale:
-        raise InputError("its metadata has no scale, so that the size of its voxels is not known; mend the metadata")
+        raise InputError("its metadata has no scale, so its voxel size is unknown; correct the metadata")
     return scale, shift
 
 

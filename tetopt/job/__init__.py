@@ -1,1 +1,1 @@
-"""A run, from files to files: what is asked for, planned, read, meshed, measured and written."""
+"""A run, from files to files: planning, reading, meshing, measuring and writing."""

@@ -1,4 +1,4 @@
-"""What the mesh of a run must keep, and what is odd about it: told as events."""
+"""Events on the mesh of a run: violated requirements, and oddities."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from tetopt.model.labels import label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
-LABEL_DICE = 0.5  # of a label with its cells: below it they hardly show the label
-NODES_MISSED = 0.01  # of the number of nodes asked for: a larger miss is said
-ENERGY_RISE = 1e-3  # relative: E that ended higher above its least value than this is said
-LENGTH_ROUNDING = 1e-3  # relative: by which an edge may miss its limit before that is said
-TARGETS_MISSED = 0.1  # of the edges: so many far over their target are said
-FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are not shown
-EULER_FRACTION = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
-EULER_USUAL = 8  # an Euler number of less counts as this: single holes come and go with the cells' size
-TOLD_BELOW_FRACTION = 0.02  # of a label's volume: less of it with fewer cells across than asked for is not said
-EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for the image
-THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
+LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represent the label
+NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
+ENERGY_RISE = 1e-3  # relative: E is reported if it ended higher above its least value
+LENGTH_ROUNDING = 1e-3  # relative: the tolerance of edges to their limits
+TARGETS_MISSED = 0.1  # of the edges: more that are far over their target are reported
+FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are lost
+EULER_FRACTION = 0.5  # of the mask's Euler number: the mesh's may differ by this much
+EULER_USUAL = 8  # smaller Euler numbers count as this one: single holes depend on the cells' size
+TOLD_BELOW_FRACTION = 0.02  # of a label's volume: a smaller part with too few cells across is not reported
+EMPTY_CELLS = 0.02  # of the cells: if more contain no voxel, there are too many for the image
+THICK_SLICES = 2.0  # times a voxel's shortest edge: if slices are this far apart, cells lie between them
 
 
 def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "mask") -> dict[str, str]:
-    """The requirements that the mesh does not meet (`tetopt.engine.requirements`), large labels without cells among
-    them, by name.
+    """Report and return, by name, the violated requirements (`tetopt.engine.requirements`), including large labels
+    without cells.
 
-    Each is told, and lesser deviations are warned of. Messages call what is meshed `word`.
+    Lesser deviations are warnings. `word` is the name of the meshed region in messages.
     """
     lost = dict(_lost(measured))
     of_result = {name: words for name, words in result.violated.items() if name not in lost}
@@ -55,7 +55,7 @@ def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "
 
 
 def _lost(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Labels of more than 200 voxels that no cell carries, by name; warns of lesser ones, and of those hardly shown."""
+    """Yield, by name, labels of more than 200 voxels without a cell; warn of smaller ones, and of poor overlap."""
     labels = measured.get("labels", [])
     lost = [row for row in labels if row.is_lost]
     words = {row.label: label_words(row.label, measured.get("label_names", {})) for row in labels}
@@ -68,29 +68,29 @@ def _lost(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         warning(
-            f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: cells are too large for them, or these are no "
-            "labels; allow more nodes, or follow every voxel by `smooth_interfaces` 0"
+            f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: elements are too large for them, or this is "
+            "not a label image; allow more nodes, or follow every voxel with `smooth_interfaces` 0"
         )
 
 
 def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if mask is None:
         return
-    if mask.components > mask.mesh_components:  # more of the mesh than of the mask is a requirement that is violated
+    if mask.components > mask.mesh_components:  # more components of the mesh than of the mask violate a requirement
         warning(
             f"the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: elements are too "
-            f"large for the {word}'s detail here; allow more nodes"
+            f"large for the {word}'s detail; allow more nodes"
         )
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
         warning(
             f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the 95th percentile, "
-            f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than its details; "
+            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are larger than its details; "
             "allow more nodes"
         )
     if abs(mask.mesh_euler - mask.euler) > EULER_FRACTION * max(abs(mask.euler), EULER_USUAL):
         warning(
             f"the Euler number of the {word}'s surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
-            f"the mesh has other holes and handles than the {word}; allow more nodes"
+            f"their holes and handles differ; allow more nodes"
         )
 
 
@@ -98,45 +98,45 @@ def warn_of_result(
     result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
     spacing: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Say what is allowed but hardly meant.
+    """Warn of results that are valid but probably not intended.
 
-    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `measured` has what was counted, and `spacing`
-    (n,) the edges of the image's voxels, mm.
+    The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts, and `spacing` (n,)
+    the edges of the image's voxels, mm.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
-        remedy = "more iterations, a `k_D` above 0, or larger sizes come nearer"
+        remedy = "use more iterations, a `k_D` above 0, or larger sizes"
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
-            remedy = f"the target sizes take about {needed}; ask for as many, or for larger sizes"
+            remedy = f"the target sizes take about {needed}; set `nodes` to that, or use larger sizes"
         warning(f"{n_nodes} nodes instead of {nodes}: {remedy}")
     lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
     if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         warning(
-            f"E ended at {last.E:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
-            "raised it; `retessellate` accept takes only those that lower it"
+            f"E ended at {last.E:.4f}, above its minimum {lowest:.4f}: a tessellation in the first n_t iterations "
+            "raised it; `retessellate` accept keeps only those that lower it"
         )
     if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
-        rise = f"{last.E_D / first.E_D:.3f} times what it was" if first.E_D > 0.0 else "above 0, which it was"
-        warning(f"E_D ended at {rise}: the cells' shapes were improved at its cost; a higher `k_D` lowers it")
+        rise = f"{last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "above its initial value 0"
+        warning(f"E_D ended at {rise}: shapes were improved at the expense of E_D; increase `k_D`")
     n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
-        remedy = "ask for fewer nodes (`nodes`)"
+        remedy = "reduce `nodes`"
         if spacing.max() >= THICK_SLICES * spacing.min():
-            remedy = f"slices are {spacing.max():.3g} mm apart, and cells between them are usual there"
+            remedy = f"slices are {spacing.max():.3g} mm apart, and cells between them are usual"
         warning(
-            f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: these contribute nothing to E_D and "
+            f"{n_empty} of {len(result.mesh.cells)} cells contain no voxel centre: these contribute nothing to E_D and "
             f"take the nearest voxel's value; {remedy}"
         )
     if crowded := measured.get("nodes_of_many_labels"):
         warning(
-            f"more than {MOST_MEETING} labels meet at {crowded} nodes, which are brought to where the first "
-            f"{MOST_MEETING} of them do"
+            f"more than {MOST_MEETING} labels meet at {crowded} nodes, which lie where the first {MOST_MEETING} of "
+            "these meet"
         )
 
 
 def tell_label_sizes(made: SizesByLabel, cells_across: float | None, table: LabelTable) -> None:
-    """Say how many nodes sizes by label take, and which labels stay below the cells asked for, the thinnest first."""
-    larger = "" if made.scale == 1.0 else f"; with fewer, edges are {made.scale:.2f} times as long"
-    note(f"sizes by label take about {made.nodes} nodes{larger}")
+    """Report the nodes that sizes by label take, and the labels with too few cells across, the thinnest first."""
+    larger = "" if made.scale == 1.0 else f"; with fewer nodes, edges are {made.scale:.2f} times as long"
+    note(f"sizes by label require about {made.nodes} nodes{larger}")
     below = [each for each in made.layers if each.below >= TOLD_BELOW_FRACTION]
     if below and cells_across is not None:
         rows = [
@@ -148,19 +148,19 @@ def tell_label_sizes(made: SizesByLabel, cells_across: float | None, table: Labe
 
 
 def warn_of_sizes(sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None) -> None:
-    """Say which limits and targets of sizes the edges, from shortest to longest, mm, do not meet."""
+    """Warn of size limits and targets that the edges, from shortest to longest, mm, do not meet."""
     if sizes.longest is not None and longest > sizes.longest * (1.0 + LENGTH_ROUNDING):
         warning(
             f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over `edge_max` "
-            f"{sizes.longest:g}: no split or collapse makes such an edge, but nodes move apart; ask for less"
+            f"{sizes.longest:g}: splits and collapses keep the limit, but nodes move apart; lower it"
         )
     if shortest < sizes.smallest * (1.0 - LENGTH_ROUNDING):
         warning(
             f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} under `size_min` "
-            f"{sizes.smallest:g}: no split makes such an edge, but nodes move together; ask for more"
+            f"{sizes.smallest:g}: splits keep the limit, but nodes move together; raise it"
         )
     if edges is not None and edges.above > TARGETS_MISSED:
         warning(
-            f"{edges.above:.0%} of the edges are over {LONG_EDGE:.2f} times their target size: there are too few "
-            "nodes; ask for more, or for larger sizes"
+            f"{edges.above:.0%} of the edges are longer than {LONG_EDGE:.2f} times their target size; allow more "
+            "nodes, or use larger sizes"
         )

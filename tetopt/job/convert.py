@@ -1,4 +1,4 @@
-"""A mesh's file written for a solver, with what else is said of it."""
+"""Conversion of a mesh's file for a solver."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from tetopt.report.summary import model_summary, versions
 
 
 class Converted(NamedTuple):
-    """What was written for a solver."""
+    """The result of a conversion."""
 
     model: Model
-    options: SolverOptions  # with what they were by default
+    options: SolverOptions  # with their defaults
     numbers: dict[str, Any]  # as `tetopt convert --json` writes them
 
 
@@ -59,22 +59,22 @@ def convert_file(
     solver : SolverOptions
     part : LabelledPart
     image : Path, optional
-        What means and mappings are of, instead of what the mesh's file has.
+        The source of means and mappings, instead of the mesh's file.
     mask : Path, optional
-        Only what lies in it counts.
+        Use only the voxels within it.
     results : Path, optional
-        CalculiX's of this mesh, which come back onto it.
+        CalculiX's results for this mesh, to be added to it.
 
     Raises
     ------
     InputError
-        Options that cannot be, files that cannot be read or do not belong together.
+        Options are invalid; files cannot be read, or do not belong together.
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
-        raise InputError(f"`results`: expected OUT named {' or '.join(VTK_SUFFIXES)}, got {output}")
+        raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
     needs_image = {"mask": mask, "volume": part.volume, "crop": part.crop, "slice": part.slice_}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
-        raise InputError(f"`{lost[0]}`: there is no `image`")
+        raise InputError(f"`{lost[0]}`: needs `image`")
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
     loaded = with_labels(loaded, part.labels)
@@ -82,7 +82,7 @@ def convert_file(
     solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if image is None and solver.average is not None:
-        raise InputError(f"`average`: {solver.average} is over an image's voxels; give the image (`image`)")
+        raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
     if not solver.loads and not is_surface:
         solver = replace(solver, loads=loads_of(loaded))
     about, box = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box
@@ -95,7 +95,7 @@ def convert_file(
         about |= {"image": image.name, "image_sha256": sha256(image)}
     if box is not None:
         about["box"] = box_text(box)
-    if is_surface:  # which holds no materials
+    if is_surface:  # a surface has no materials
         kept = {name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS}
         loaded = loaded._replace(cell_data=kept)
     model = with_chosen_sets(model_of_file(loaded, voxels, solver, about, box), output, solver)
@@ -107,19 +107,19 @@ def convert_file(
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
-    """The texts of the mesh's file that go on; the forces that hold sets, which are in RAS+ and mN, only as such."""
+    """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and units are unchanged."""
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
     names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
     return {name: text for name in (*TEXTS_KEPT, *names) if (text := loaded.text(name)) is not None}
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
-    """The mesh with a solver's results in place of earlier ones, of the order that was solved; they are told."""
+    """Return the mesh with a solver's results instead of earlier ones, of the solved order; report the results."""
     results = read_frd(path, loaded.mesh)
     for line in results.notes:
         note(f"{path}: {line}")
     for name, values in results.point_data.items():
-        if values.shape[1:] != (9,):  # tensors have their von Mises stress beside them
+        if values.shape[1:] != (9,):  # tensors come with their von Mises stress
             largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
             progress(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}")
     loaded = without_results(loaded)
@@ -128,10 +128,10 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
 
 
 def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
-    """The mesh's sets and those of the solver's input file, if it is there and of this mesh; a line."""
+    """Return the mesh's sets and those of the solver's input file, if it exists and belongs to this mesh; note it."""
     from_input = input_sets(path, loaded.mesh) if path.is_file() else None
     if from_input is None:
-        note(f"{path}: not the input file of this mesh, or missing: its sets are not added")
+        note(f"{path}: missing, or not the input file of this mesh; its sets are not added")
         return loaded.sets
     sets, renamed = merged_sets(loaded.sets, from_input)
     for old, new in renamed.items():
@@ -140,18 +140,18 @@ def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
 
 
 def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
-    """The order of the cells to be written: as asked for, else as in the mesh's file, if the format has it."""
+    """Return the order of the cells to write: as requested, else as in the mesh's file, if the format supports it."""
     form = format_of(output)
     if solver.order is not None or loaded.order == 1 or form.has_quadratic:
         return solver.order or loaded.order
     if not form.is_surface:
-        note(f"{output}: {form.what} has no quadratic cells; the mesh's are written as linear ones")
+        note(f"{output}: {form.what} has no quadratic cells; they are written as linear cells")
     return 1
 
 
 def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:
-    """The image as it is, and as it counts: beyond the mask continued by the nearest value inside."""
+    """Read the image, and the same continued beyond the mask by the nearest value inside."""
     whole, beside = image_and_others(path, part)
     if whole.ndim != ndim:
-        raise InputError(f"{path}: expected a {ndim}-D image, as the mesh is, got a {whole.ndim}-D one")
+        raise InputError(f"{path}: expected a {ndim}-D image like the mesh, got a {whole.ndim}-D one")
     return whole, continued(whole, None if mask_path is None else beside(mask_path, resample_mask))

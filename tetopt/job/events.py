@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: data with a text, for a terminal, a notebook or a program to show."""
+"""Events of a run: data with a text, which a terminal, a notebook or a program can show."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from tetopt.errors import warn
 
 KERNEL_WORDS = "preparing the kernels (the first run compiles them, half a minute)"  # a stage of every run
 Kind = Literal["started", "progress", "note", "warning", "violated"]
-"""A stage begins; how far it is; a line to know; what is odd; a requirement that the mesh does not meet."""
+"""A stage begins; its progress; a note; an oddity; a requirement that the mesh does not meet."""
 
 
-ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "no more memory is allowed", "stopped": "interrupted"}
+ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "memory limit reached", "stopped": "interrupted"}
 
 
 class Stage(NamedTuple):
-    """What a run begins with now."""
+    """A stage that a run begins."""
 
     name: str  # read, start, kernels, optimise, parts, write, ...
     number: int | None  # of iterations
 
 
 class Event(NamedTuple):
-    """One of the things that a run tells.
+    """An event of a run.
 
     Parameters
     ----------
     kind : {"started", "progress", "note", "warning", "violated"}
-        A stage began; how far it is; a line to know; what is odd; a requirement that is not met.
+        A stage begins; its progress; a note; an oddity; a requirement that is not met.
     text : str
-        On one line. Arguments of the job stand between backticks: "`nodes`".
+        On one line. Arguments of the job are between backticks: "`nodes`".
     data : object
-        Of "started" the `Stage`; of "progress" what that counts, such as an `IterationRecord`; of "violated" the
+        For "started" the `Stage`; for "progress" the state, such as an `IterationRecord`; for "violated" the
         requirement's name.
 
     Examples
@@ -52,7 +52,7 @@ Listener = Callable[[Event], None]
 
 
 def _unheard(event: Event) -> None:
-    """Without a listener, warnings and violated requirements are Python's warnings, and nothing else is said."""
+    """Turn warnings and violated requirements into Python's warnings, and ignore other events."""
     if event.kind in ("warning", "violated"):
         warn(event.text)
 
@@ -62,7 +62,7 @@ _LISTENER: ContextVar[Listener] = ContextVar("listener", default=_unheard)
 
 @contextmanager
 def listened(listener: Listener | None) -> Iterator[None]:
-    """Within it a listener gets the events; None leaves the one that there is."""
+    """Send events to a listener within this context; None keeps the current listener."""
     token = _LISTENER.set(_LISTENER.get() if listener is None else listener)
     try:
         yield
@@ -71,33 +71,33 @@ def listened(listener: Listener | None) -> Iterator[None]:
 
 
 def ended_words(ended: str, kept: str) -> str:
-    """Why a run has ended before its last iteration, and what is kept of it."""
+    """Return why a run ended before its last iteration, and what is kept."""
     if ended == "converged":
-        return "converged: hardly anything changes any more"
+        return "converged: the mesh hardly changes any more"
     return f"{ENDED_WORDS[ended]}: {kept} is kept"
 
 
 def started(stage: str, text: str = "", number: int | None = None) -> None:
-    """Tell that a stage begins, which ends the one before, and how many iterations it has."""
+    """Report that a stage begins, which ends the previous one, and its number of iterations."""
     _LISTENER.get()(Event("started", text, Stage(stage, number)))
 
 
 def progress(text: str, data: Any = None) -> None:
-    """Tell how far the stage is."""
+    """Report the progress of the stage."""
     _LISTENER.get()(Event("progress", text, data))
 
 
 def note(text: str) -> None:
-    """Tell something that is good to know."""
+    """Report a note."""
     _LISTENER.get()(Event("note", text))
 
 
 def warning(text: str) -> None:
-    """Tell something that is allowed, but hardly meant."""
+    """Report something valid that is probably not intended."""
     _LISTENER.get()(Event("warning", text))
 
 
 def violated(text: str, name: str | None = None) -> None:
-    """Tell what the mesh should be and is not; of a run's requirement with its name."""
+    """Report a violation; `name` is that of a run's requirement."""
     words = text if name is None else f"requirement violated: {name}: {text}"
     _LISTENER.get()(Event("violated", words, name))

@@ -1,4 +1,4 @@
-"""A run in parts: asked for, or chosen where an image does not fit into memory."""
+"""A run in parts: requested, or chosen because an image does not fit into memory."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, mesh_in_par
 from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, identity, removed
 from tetopt.system.budget import BYTES_PER_GB, available_bytes, memory_words
 
-MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
-MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
-VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
-# Options that look at all cells or voxels at once, and the values of them that parts take besides none at all.
+MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole, with all features of a run in one piece
+MOST_DRAWN = 2**27  # voxels of the image level that is drawn
+VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
+# Options that need all cells or voxels at once, and the values, other than none, that parts accept.
 PARTS_TAKE: dict[str, Any] = {
     "mask": None, "background": None, "labels": None, "tissues": None, "slice_": None, "target_error": None,
     "edge_size": None, "sizing": None, "max_gb": None, "order": 1, "boundary": "slide",
 }  # fmt: skip
-LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # likewise, if the image is left in its file
+LEFT_TAKE: dict[str, Any] = {"average": DEFAULT_AVERAGE}  # the same, if the image stays in its file
 
 
 def with_parts(plan: Plan) -> Plan:
-    """The plan with a number of parts, if it is to be made in some: as asked for, or for want of memory.
+    """Return the plan with a number of parts if the run is in parts: on request, or for lack of memory.
 
     Raises
     ------
     InputError
-        Options that parts do not have, or that only they have; dask not installed.
+        Options that runs in parts do not support, or that only they support; dask is not installed.
     """
     job, unsupported = plan.job, _unsupported_option(plan)
     if job.parts is None:
@@ -69,18 +69,20 @@ def with_parts(plan: Plan) -> Plan:
         if needed <= free or unsupported is not None:
             names = (field.name for field in dataclasses.fields(PartsOptions) if getattr(job, field.name) is not None)
             if (name := next(names, None)) is not None:
-                note(f"`{name}`: has no say, as the mesh is made in one piece; `parts` asks for parts")
+                note(f"`{name}` is ignored: the mesh is built in one piece (use `parts` to partition it)")
             return plan
         note(
-            f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
-            "in parts"
+            f"meshing in one piece would take {memory_words(needed)} of memory, {memory_words(free)} is free: the "
+            "mesh is built in parts"
         )
     elif unsupported is not None:
         raise InputError(unsupported)
     if job.worker_gb is not None and not job.worker_gb > 0.0:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
     if job.worker_gb is not None and (job.scheduler or job.cluster):
-        raise InputError("`worker_gb`: of workers on this machine; those of `scheduler` and `cluster` have their own")
+        raise InputError(
+            "`worker_gb`: only for workers on this machine; those of `scheduler` and `cluster` have their own"
+        )
     check_choice(job.workers, job.scheduler, job.cluster, "blocks")
     file = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
     return plan._replace(division=Division(job.parts or 1), left=file if _is_left(plan) else None)
@@ -91,7 +93,7 @@ def _is_storable(path: Path) -> bool:
 
 
 def _whole_bytes(plan: Plan) -> float:
-    """What a graded mesh of an image that could be left in its file takes in one piece; 0 of others."""
+    """Return the bytes that a graded mesh of an image that could stay in its file takes in one piece; 0 for others."""
     path = plan.job.images[0]
     check_local(path)
     if not _is_storable(path) or plan.job.slice_ is not None or plan.mode != "graded":
@@ -102,48 +104,48 @@ def _whole_bytes(plan: Plan) -> float:
 
 
 def _n_voxels(plan: Plan) -> int:
-    """Of the image, by its header, cropped."""
+    """Return the number of voxels of the cropped image, by its header."""
     return prod(cropped_shape(plan, (file_shape(plan.job.images[0]) or (0,))[:3]))
 
 
 def _unsupported_option(plan: Plan) -> str | None:
-    """What a mesh in parts cannot be, in words; None if there is nothing."""
+    """Return the message for an option that parts do not support; None if there is none."""
     job = plan.job
     if plan.mode != "graded":
-        return "`parts`: of a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
+        return "`parts`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
     if len(job.images) > 1:
-        return f"`parts`: expected one IMAGE, got {len(job.images)}; leave the others out, or `parts`"
+        return f"`parts`: expected one IMAGE, got {len(job.images)}; leave out the others, or `parts`"
     return _whole_only(plan, PARTS_TAKE)
 
 
 def _whole_only(plan: Plan, taken: dict[str, Any]) -> str | None:
-    """The first of the options that has another value than none and the one that is taken, in words."""
+    """Return the message for the first option whose value is neither none nor the accepted one; None without any."""
     for name, value in taken.items():
         if getattr(plan.job, name) not in (None, value):
-            return f"`{name}`: looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
+            return f"`{name}`: needs all cells or voxels at once, which parts do not have; leave it out, or `parts`"
     return None
 
 
 def _is_left(plan: Plan) -> bool:
-    """Whether the image of a run in parts is left in its file: a large one, or one that does not fit into memory."""
+    """Return whether the image of a run in parts stays in its file, being large or not fitting into memory."""
     if not _is_storable(plan.job.images[0]):
         return False
     return _n_voxels(plan) > MOST_LOADED or _whole_bytes(plan) > available_bytes()
 
 
 def left_source(plan: Plan) -> Source | None:
-    """The image of a run in parts that is left in its file, of which one pass takes the statistics; None of others."""
+    """Return the image of a run in parts that stays in its file, with statistics from one pass; None for others."""
     if plan.left is None:
         return None
     path = plan.left.path
     if (unsupported := _whole_only(plan, LEFT_TAKE)) is not None:
         raise InputError(unsupported)
     if plan.job.young is not None:
-        note("`young`: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
+        note("`young`: a formula or a table is applied to cell means, as the voxels stay in their file")
     level = coarse_image(path, MOST_DRAWN) if plan.pictures and plan.job.crop is None else None
     if plan.pictures and level is None:
         raise InputError(
-            f"`figures`: {path} has no level of {MOST_DRAWN:.3g} voxels or fewer to draw, or is cropped; leave it out"
+            f"`figures`: {path} is cropped, or has no level of {MOST_DRAWN:.3g} voxels or fewer; leave out `figures`"
         )
     image = open_stored(path, volume=plan.left.volume, crop=plan.left.crop)
     note(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file")
@@ -157,19 +159,19 @@ def left_source(plan: Plan) -> Source | None:
 
 
 class PartsProgress(NamedTuple):
-    """How far a run in parts is."""
+    """Progress of a run in parts."""
 
     now: Round
-    history: list[IterationRecord]  # of the rounds that are done
+    history: list[IterationRecord]  # of the finished rounds
 
 
 def run_in_parts(
     task: Task, check: Callable[[Mesh], None], stop: Callable[[], bool], ends: float | None
 ) -> tuple[Parted, float]:  # fmt: skip
-    """Run, or go on with, a mesh in parts; what came of it, and the memory predicted for each worker's task, bytes.
+    """Run or resume a mesh in parts; return the result, and the predicted memory of each worker's task, bytes.
 
-    `check` is given the initial mesh before a part begins; `stop` says when to end, and so does the clock at `ends`, as
-    of `time.perf_counter`.
+    `check` gets the initial mesh before a part begins; the run ends once `stop` returns true, or at the time `ends` of
+    `time.perf_counter`.
     """
     source, folder, request = task.source, work_folder(task.plan.job.output), _request(task)
     task_bytes = 0.0
@@ -181,7 +183,7 @@ def run_in_parts(
     def crew(n_parts: int, n_bytes: float) -> Iterator[Runner]:
         nonlocal task_bytes
         task_bytes = n_bytes
-        note(f"{counted(n_parts, 'part')} or more in a round, each of up to {memory_words(n_bytes)}")
+        note(f"{counted(n_parts, 'part')} or more per round, each up to {memory_words(n_bytes)}")
         started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
         started("parts", "optimising in parts")
@@ -202,8 +204,8 @@ def run_in_parts(
             ),
         )  # fmt: skip
     except BaseException:  # Ctrl-C among them
-        if task_bytes > 0.0 and (folder / STATE_NAME).exists():  # there were workers
-            note(f"{folder} has what is done: run this again to go on, or remove it")
+        if task_bytes > 0.0 and (folder / STATE_NAME).exists():  # workers have begun
+            note(f"{folder} keeps the finished parts: run the same command again to continue, or remove it")
         raise
     started("optimised", "optimised")
     result = parted.result
@@ -216,14 +218,14 @@ def run_in_parts(
 
 @contextlib.contextmanager
 def _team(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iterator[Workers]:
-    """The workers that a job asks for, for so many parts of up to so many bytes; InputError for too little room."""
+    """Start the workers of a job for this number of parts and bytes; raise InputError for too little memory."""
     most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
     need = Need(n_parts, n_bytes, job.threads, is_within=True, most_bytes=most)
-    here = folder.absolute()  # workers that others started have folders of their own to begin with
+    here = folder.absolute()  # workers started elsewhere have other current folders
     folders = Folders(here, here / LOGS_NAME)
     folders.logs.mkdir(exist_ok=True)
     if job.scheduler is None and job.cluster is None:
-        _check_room(need, local_share(need, job.workers).bytes)  # with too little a worker does not even start
+        _check_room(need, local_share(need, job.workers).bytes)  # a worker with too little does not even start
     with workers(need, folders, count=job.workers, scheduler=job.scheduler, cluster=job.cluster) as team:
         note(team.words)
         _check_room(need, team.bytes)
@@ -231,17 +233,17 @@ def _team(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iterat
 
 
 def _check_room(need: Need, room: float) -> None:
-    """InputError if a part needs more memory than a worker has for it."""
+    """Raise InputError if a part needs more memory than its worker has."""
     if need.task_bytes > room:
         raise InputError(
             f"a part needs about {memory_words(need.task_bytes)} of memory, its worker "
-            f"{memory_words(need.limit_for(need.task_bytes))} in all, and has too little; ask for more `parts`, for "
-            "fewer `workers`, or give them more memory"
+            f"{memory_words(need.limit_for(need.task_bytes))} in total, and has less; increase `parts`, reduce "
+            "`workers`, or give them more memory"
         )
 
 
 def _request(task: Task) -> PartsRequest:
-    """What is asked for, with a checksum of all on which the mesh depends."""
+    """Return the request for a mesh in parts, with a checksum of everything that the mesh depends on."""
     plan, sizes = task.plan, task.sizes
     engine, nodes = plan.engine_options, task.size.n_nodes
     values: dict[str, Any] = {
@@ -260,10 +262,10 @@ def _request(task: Task) -> PartsRequest:
 
 
 def end_parts(mesh: Path, result: MeshingResult) -> None:
-    """Remove the work directory of a run that is complete; say what becomes of that of another."""
+    """Remove the work directory of a complete run; report on that of an incomplete one."""
     folder = work_folder(mesh)
     if result.ended in ("iterations", "converged"):
         if left := removed(folder):
-            warning(f"{folder}: stays with what is not tetopt's in it: {', '.join(left)}")
+            warning(f"{folder} was not removed, as it contains foreign files: {', '.join(left)}")
     else:
-        note(f"{folder}: run this again with `force` to go on, or remove it")
+        note(f"{folder}: run the same command again with `force` to continue, or remove it")

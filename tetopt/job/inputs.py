@@ -1,4 +1,4 @@
-"""Read the files that a command names; what is wrong with them is refused or said."""
+"""Read the files of a command; refuse or report their faults."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
 from tetopt.system.incoming import json_of, rows_of
 
-IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
-SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # of the column of sizes in a table
-NAMES_LISTED = 8  # a line's worth
-AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
+IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: grids' differences do not explain less in the image
+SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
+NAMES_LISTED = 8  # as many as fit on a line
+AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
 
 def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
-    """The image as the options ask for it."""
+    """Read the part of an image that the options select."""
     slice_ = part.slice_ if isinstance(part, ImagePart) else None
     return load_image(
         path,
@@ -50,7 +50,7 @@ def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
 
 
 def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
-    """A 3-D image; InputError for a picture."""
+    """Read a 3-D image; raise InputError for a 2-D one."""
     image = read_image(path, part)
     if image.ndim != 3:
         raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
@@ -58,11 +58,11 @@ def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
 
 
 def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
-    """A label image, cut as the image was; InputError unless it lies on the image's voxels."""
+    """Read the same part of a label image; raise InputError unless it lies on the image's voxels."""
     labels = read_image(path, replace(part, volume=None))
     if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=AFFINE_MM):
         raise InputError(
-            f"{path}: expected labels on the image's own voxels, {image.shape} with its affine, got {labels.shape}; "
+            f"{path}: expected labels on the image's grid, {image.shape} with its affine, got {labels.shape}; "
             "resample them to the image first"
         )
     check_labels(str(path), labels)
@@ -70,7 +70,7 @@ def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
 
 
 def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
-    """The volume, and labels on its voxels, if they are given."""
+    """Read a volume, and labels on its voxels if there are any."""
     image = read_volume(path, part)
     return image, None if labels_path is None else read_labels(labels_path, image, part)
 
@@ -78,9 +78,9 @@ def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tup
 def image_and_others(
     path: Path, part: ImagePart
 ) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:
-    """The image as the options ask for it, and a function that reads files beside it and aligns them to its voxels."""
+    """Read the selected part of an image; return it and a function that reads other files and aligns them to it."""
     image = read_image(path, part)
-    # A slice has lost its place across it: what goes with it is aligned to the whole image and sliced like that.
+    # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
     whole = image if part.slice_ is None else read_image(path, ImagePart(volume=part.volume))
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
@@ -98,18 +98,18 @@ def image_and_others(
 
 
 def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
-    """That a file lay on another grid, and how much of a mask or of labels is in the image unless that is cropped."""
+    """Report that a file was resampled, and, unless cropped, how much of a mask or labels lies in the image."""
     if is_contrast:
-        note(f"{path}: taken to the image's voxels, linearly")
+        note(f"{path}: resampled to the image's grid (linear)")
         return
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
-    note(f"{path}: taken to the image's voxels, nearest neighbour")
+    note(f"{path}: resampled to the image's grid (nearest neighbour)")
     if not is_cropped and inside < IN_IMAGE_FRACTION * whole:
-        warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
+        warning(f"{path}: only {inside / whole:.0%} of it lies within the image; is it of the same scan?")
 
 
 def read_companion(path: Path) -> Image:
-    """A file beside the image; one value everywhere, which would be odd in an image, is not in sizes or a mask."""
+    """Read a file beside the image, without the warning for a constant image, which sizes or a mask may be."""
     file, volume = file_and_volume(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "(?s).* everywhere, so E_D is 0")
@@ -117,7 +117,7 @@ def read_companion(path: Path) -> Image:
 
 
 def file_and_volume(path: Path) -> tuple[Path, int | None]:
-    """A file beside the first image, and the volume of it that `FILE:K` names."""
+    """Split `FILE:K` into a file and the volume that K names."""
     name, colon, volume = str(path).rpartition(":")
     if colon and re.fullmatch("[0-9]{1,18}", volume) and not path.exists():
         return Path(name), int(volume)
@@ -125,12 +125,12 @@ def file_and_volume(path: Path) -> tuple[Path, int | None]:
 
 
 def tissue_files(path: Path | None) -> list[Path]:
-    """The files of tissues that an option names between commas."""
+    """Split an option into the files of tissues, separated by commas."""
     return [] if path is None else [Path(name.strip()) for name in str(path).split(",")]
 
 
 def tissue_volumes(path: Path) -> dict[str, Path]:
-    """The files of tissues, or `FILE:K` for each volume of one, by what the tissues are called; InputError."""
+    """Return the files of tissues, or `FILE:K` for each volume of one, by the tissues' names; raise InputError."""
     files = tissue_files(path)
     if Path() in files or len(set(files)) < len(files):
         raise InputError(f"`tissues`: expected different files, separated by commas, got {path}")
@@ -143,7 +143,7 @@ def tissue_volumes(path: Path) -> dict[str, Path]:
 
 
 def number_of(name: str, text: str) -> float:
-    """The number that an option's text is; InputError, with the option's name, if it is none."""
+    """Convert an option's text to a number; raise InputError with the option's name if it is not one."""
     try:
         return float(text)
     except ValueError:
@@ -151,7 +151,7 @@ def number_of(name: str, text: str) -> float:
 
 
 class Balance(NamedTuple):
-    """How much images and labels count beside one another, and how tense surfaces between labels are."""
+    """Weights of images and labels, and tension of the surfaces between labels."""
 
     weights: list[float]
     label_weight: float = 1.0
@@ -159,7 +159,7 @@ class Balance(NamedTuple):
 
 
 def balance_of(options: SourceOptions) -> Balance:
-    """The balance that is asked for, with its defaults."""
+    """Return the requested balance, with defaults."""
     weights = [1.0] * len(options.images)
     if options.weights is not None:
         weights = [number_of("`weights`", part) for part in options.weights.split(",")]
@@ -168,25 +168,25 @@ def balance_of(options: SourceOptions) -> Balance:
 
 
 def read_mesh(path: Path) -> MeshFile:
-    """A mesh of the user's; what had to be turned, left out or renamed is said."""
+    """Read a mesh of the user's; report inverted, dropped and renamed parts."""
     loaded = load_mesh(path)
     if loaded.n_turned:
-        warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+        warning(f"{path}: reoriented {loaded.n_turned} inverted cells")
     if loaded.n_left:
-        note(f"{path}: {loaded.n_left} cells of lower dimension are left out")
+        note(f"{path}: dropped {loaded.n_left} cells of lower dimension")
     for line in loaded.notes:
         note(f"{path}: {line}")
     return loaded
 
 
 def with_labels(loaded: MeshFile, path: Path | None) -> MeshFile:
-    """The mesh with the labels of an image on its cells, those of most of their voxels, instead of its file's own."""
+    """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
     if path is None:
         return loaded
     labels = read_companion(path)
     check_labels(str(path), labels)
     if labels.ndim != loaded.mesh.ndim:
-        raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels, as the mesh is, got a {labels.ndim}-D image")
+        raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
     try:
         return loaded._replace(cell_data={**loaded.cell_data, "label": cell_labels(labels, loaded.mesh)})
     except InputError as error:
@@ -194,18 +194,18 @@ def with_labels(loaded: MeshFile, path: Path | None) -> MeshFile:
 
 
 def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable:
-    """Names and colours of labels: those of the file, else those that the mesh's file keeps, else none."""
+    """Return names and colours of labels: those of the file, else those in the mesh's file, else none."""
     if path is not None:
         table = load_label_table(path)
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
-            warning(f"{path}: names none of the mesh's labels, {listed(np.unique(labels).tolist())}")
+            warning(f"{path}: contains none of the mesh's labels, {listed(np.unique(labels).tolist())}")
         return table
     return NO_TABLE if loaded is None else loaded.label_table
 
 
 def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
-    """Sizes by label, as an option or a file has them; names become numbers by a table of labels, if there is one."""
+    """Parse sizes by label, from an option or a file; a table of labels, if any, converts names to numbers."""
     file = named_file(text)
     if file is not None:
         text = ",".join(f"{name}={''.join(cells[:1])}" for name, cells in rows_of(file, "table of sizes", SIZE_HEADS))
@@ -217,12 +217,12 @@ def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str
 
 
 def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int | str, LabelSize]:
-    """The sizes with labels' numbers for their names."""
+    """Return the sizes by the labels' numbers instead of names."""
     numbers = {name: label for label, name in table.names.items()}
     known = {name: size for name, size in sizes.items() if isinstance(name, int) or name in (*numbers, EVERY_LABEL)}
     if unknown := [name for name in sizes if name not in known]:
         raise InputError(
-            f'label_size: no label is called "{unknown[0]}"; {listed([*numbers]) or "the labels have no names"}'
+            f'label_size: no label has the name "{unknown[0]}"; {listed([*numbers]) or "the labels have no names"}'
         )
     by_label: dict[int | str, LabelSize] = {}
     for name, size in known.items():
@@ -234,13 +234,13 @@ def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int
 
 
 def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
-    """The first of some names in words, and how many more there are."""
+    """Return the first names as a text, with the number of further ones."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(map(str, names[:most])) + more
 
 
 def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
-    """A table among the texts of a mesh's file; empty without one, or if it is another program's."""
+    """Return a table from the texts of a mesh's file; empty if it is missing or another program's."""
     try:
         table = json_of(loaded.text(name) or "{}")
     except ValueError:
@@ -249,21 +249,21 @@ def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
 
 
 def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:
-    """A warning if the mesh's file names another image than this one as its source; whether it does."""
+    """Warn if the mesh's file names another source image than this one; return whether it does."""
     made_from = loaded.text("image_sha256")
     is_other = made_from is not None and made_from != sha256(image_path)
     if is_other:
-        warning(f"{mesh_path} was made from another image than {image_path}")
+        warning(f"{mesh_path} was built from a different image, not {image_path}")
     return is_other
 
 
 def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
-    """Files in a folder by their names; InputError as `checked_output`."""
+    """Return files in a folder by name; raise InputError as `checked_output`."""
     return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
 
 
 def set_threads(threads: int | None) -> None:
-    """Compute on so many threads, or as before; InputError for more than there are."""
+    """Set the number of threads, or leave it; raise InputError for more than the machine has."""
     if threads is None:
         return
     most = int(numba.config.NUMBA_NUM_THREADS)
@@ -273,8 +273,8 @@ def set_threads(threads: int | None) -> None:
 
 
 def cell_field(loaded: MeshFile, path: Path, name: str) -> NDArray:
-    """A field of a mesh's file, one number a cell; InputError, with those that there are, if it is not there."""
+    """Return a field of a mesh's file, one number per cell; raise InputError with the known fields if it is missing."""
     known = [each for each, values in loaded.cell_data.items() if values.ndim == 1]
     if name not in known:
-        raise InputError(f'{path}: has no "{name}" on its cells; it has {", ".join(known) or "nothing"}')
+        raise InputError(f'{path}: has no cell field "{name}"; it has {", ".join(known) or "none"}')
     return loaded.cell_data[name]

@@ -1,4 +1,4 @@
-"""A run as one record: every option of `tetopt mesh`, checked, in JSON and back."""
+"""A run as one record: every option of `tetopt mesh`, validated, and converted to and from JSON."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
+from inspect import cleandoc
 from numbers import Integral, Real
 from pathlib import Path
 from textwrap import wrap
@@ -21,17 +22,17 @@ from tetopt.system.incoming import json_of
 from tetopt.system.public import LARGEST_INTEGER
 
 Record = TypeVar("Record")
-MOST_SAID = 80  # letters of a value in a message
-UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # of a number, by what its value is called
+MOST_SAID = 80  # characters of a value in a message
+UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar
 KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job(JobOptions):
-    """A run, from files to files: each option of `tetopt mesh` once, under its own name.
+    """A run, from files to files, with each option of `tetopt mesh` as a field.
 
-    Mappings and loads are the texts of the command line; a number may stand for a mapping to one value. None is the
-    default, which may depend on the image.
+    Mappings and loads are texts as on the command line; a number is a mapping to one value. None means the default,
+    which may depend on the image.
 
     Parameters
     ----------
@@ -40,11 +41,11 @@ class Job(JobOptions):
     Raises
     ------
     InputError
-        Values of another kind, out of range or that contradict each other, as far as no file has to be read.
+        Values have the wrong type, are out of range, or contradict each other, as far as no file has to be read.
 
     See Also
     --------
-    run : Runs it.
+    run : Run it.
 
     Examples
     --------
@@ -54,22 +55,22 @@ class Job(JobOptions):
     >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, target_error=0.1)
     Traceback (most recent call last):
     ...
-    tetopt.errors.InputError: `nodes` and `target_error`: give one of them
+    tetopt.errors.InputError: `nodes` and `target_error`: give only one of them
     """
 
     def __post_init__(self) -> None:
-        """Bring values to the kinds of their fields, and refuse those that cannot be."""
+        """Convert values to the types of their fields, and refuse invalid ones."""
         for name in kinds_of(Job):
             object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
         resolved(self)
 
     def given(self) -> dict[str, Any]:
-        """Options that are not the default, by name; paths as texts.
+        """Return options that differ from the default, by name; paths as texts.
 
         Returns
         -------
         dict
-            Of what JSON holds.
+            Values that JSON can hold.
 
         Examples
         --------
@@ -80,12 +81,12 @@ class Job(JobOptions):
         return {field.name: _in_words(value) for field, value in values if value != field.default}
 
     def to_json(self) -> str:
-        """The options as JSON, which `from_json` reads.
+        """Return the options as JSON, which `from_json` reads.
 
         Returns
         -------
         str
-            An object of the options that are not the default.
+            An object of the options that differ from the default.
 
         Examples
         --------
@@ -96,12 +97,12 @@ class Job(JobOptions):
 
     @classmethod
     def from_json(cls, text: str) -> Job:
-        """The job of a text of JSON.
+        """Create a job from JSON.
 
         Parameters
         ----------
         text : str
-            An object of options, as of `to_json`.
+            An object of options, as from `to_json`.
 
         Returns
         -------
@@ -110,7 +111,7 @@ class Job(JobOptions):
         Raises
         ------
         InputError
-            Not JSON, an option that there is not, or values that no `Job` takes.
+            The text is not JSON; an option is unknown, or a value invalid.
 
         Examples
         --------
@@ -125,14 +126,14 @@ class Job(JobOptions):
             raise InputError(f"job: expected an object of options, got {type(table).__name__}")
         for name in table:
             if name not in kinds_of(cls):
-                raise InputError(f"job: has no option {name[:80]!r}" + near_hint(name, kinds_of(cls)))
+                raise InputError(f"job: unknown option {name[:80]!r}" + near_hint(name, kinds_of(cls)))
         if lost := [each.name for each in fields(cls) if each.default is MISSING and each.name not in table]:
-            raise InputError(f"job: needs {' and '.join(lost)}")
+            raise InputError(f"job: missing {' and '.join(lost)}")
         return cls(**table)
 
 
 def _parameters() -> str:
-    """The options of a job as its docstring lists them."""
+    """Return the options of a job for its docstring."""
     lines = []
     for field in fields(Job):
         kind = kinds_of(Job)[field.name]
@@ -146,28 +147,28 @@ def _parameters() -> str:
                 re.sub(r"\w+://\S*\w", r"``\g<0>``", option.text), 108, initial_indent="    ", subsequent_indent="    "
             ),
         ]
-    return "\n    ".join(lines)
+    return "\n".join(lines)
 
 
 def _kind_words(kind: Any) -> str:
-    """A kind of values as docstrings have it."""
+    """Return a type as docstrings name it."""
     own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     if get_origin(own) is Literal:
         return "{" + ", ".join(map(repr, get_args(own))) + "}"
     return f"list of {_kind_words(get_args(own)[0])}" if get_origin(own) is list else own.__name__.lower()
 
 
-if Job.__doc__:
-    Job.__doc__ = Job.__doc__.replace("PARAMETERS", _parameters())
+if Job.__doc__:  # of which Python takes the indentation off from 3.13 on
+    Job.__doc__ = cleandoc(Job.__doc__).replace("PARAMETERS", _parameters())
 
 
 def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
-    """A record of options with values of the kinds of their fields; InputError for one that cannot be."""
+    """Create a record of options, converting values to the fields' types; raise InputError for an invalid one."""
     return record(**{name: _of_field(record, name, value) for name, value in values.items()})
 
 
 def _of_field(record: Any, name: str, value: Any) -> Any:
-    """A value of the kind of a record's field, and no less than that may be."""
+    """Convert a value to the type of a record's field, and check its minimum."""
     kind = kinds_of(record)[name]
     value, least = _of_kind(name, get_args(kind)[0], value), option_of(kind).least
     if value is not None and least is not None and value < least:
@@ -176,7 +177,7 @@ def _of_field(record: Any, name: str, value: Any) -> Any:
 
 
 def _of_kind(name: str, kind: Any, value: Any) -> Any:
-    """A value of the kind of its field, made of what may stand for it; InputError if it cannot be."""
+    """Convert a value to the type of its field; raise InputError if it cannot be converted."""
     is_optional = get_origin(kind) in (Union, UnionType)
     if value is None and is_optional:
         return None
@@ -185,7 +186,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         (of_each,) = get_args(own)
         many = [value] if isinstance(value, str | Path) else value
         if not isinstance(many, list | tuple) or not many:
-            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of such, got {_said(value)}")
+            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_said(value)}")
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if own is Path and isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value):
@@ -210,18 +211,18 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
 
 
 def _number_text(value: Any) -> str:
-    """A number as a text that is read back to its last bit."""
+    """Format a number so that it is read back to its last bit."""
     return str(int(value)) if isinstance(value, Integral) else repr(float(value))
 
 
 def _said(value: Any) -> str:
-    """A value in a message."""
+    """Format a value for a message."""
     text = repr(value)
     return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}..."
 
 
 def _in_words(value: Any) -> Any:
-    """A value as JSON holds it."""
+    """Convert a value to one that JSON can hold."""
     if isinstance(value, list):
         return [_in_words(each) for each in value]
     return str(value) if isinstance(value, Path) else value

@@ -1,4 +1,4 @@
-"""A mesh's file, measured: its shape, how well its cells fit an image, and whether it is what its run was asked for."""
+"""Measures of a mesh's file: its shape, the fit of its cells to an image, and the requirements of its run."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ from tetopt.report.summary import fidelity, size_summary
 
 
 class Judgement(NamedTuple):
-    """What was measured of a mesh's file."""
+    """The measures of a mesh's file."""
 
     path: Path
     loaded: MeshFile
     shape: Quality
-    numbers: dict[str, Any]  # all of them, as `tetopt quality --json` writes them
+    numbers: dict[str, Any]  # all numbers, as `tetopt quality --json` writes them
     is_checked: bool
-    source: Source | None = None  # what it was measured on
+    source: Source | None = None  # the image, mask and labels it was measured on
     fit: ImageFit | None = None
-    result: MeshingResult | None = None  # the mesh as that of a run, with the requirements that it misses
-    measured: dict[str, Any] = {}  # noqa: RUF012 - how well mask, labels and contrasts are met; nobody changes it
+    result: MeshingResult | None = None  # the mesh as the result of a run, with violated requirements
+    measured: dict[str, Any] = {}  # noqa: RUF012 - fit to mask, labels and contrasts; never modified
 
     @property
     def is_masked(self) -> bool:
-        """Whether it was made within a mask or without a background."""
+        """True if the mesh was built within a mask or without a background."""
         inputs = table_in(self.loaded, "inputs")
         was_masked = inputs.get("mask") is not None or inputs.get("background") is not None
         return was_masked or (self.source is not None and self.source.mask is not None)
 
     @property
     def is_filled(self) -> bool:
-        """Whether it should fill the image's box: not within a mask, and not of another mesh's domain."""
+        """True if the mesh should fill the image's box: neither built within a mask nor from another mesh."""
         return not self.is_masked and table_in(self.loaded, "options").get("start") is None
 
     @property
     def left_out(self) -> list[str]:
-        """What counted for the run that made it, and does not here."""
+        """Inputs of the run that built the mesh which are missing here."""
         if self.source is None:
             return []
         inputs, there = table_in(self.loaded, "inputs"), {"mask": self.source.mask, "labels": self.source.labels}
@@ -64,8 +64,8 @@ class Judgement(NamedTuple):
 
     @property
     def requirements(self) -> dict[str, Any]:
-        """What the run that made it was asked for, as its file says; another program's mesh only fills the box."""
-        options = table_in(self.loaded, "options")  # of ours alone with a method
+        """Requirements of the run that built the mesh, from its file; another program's mesh need only fill the box."""
+        options = table_in(self.loaded, "options")  # only tetopt's have a method
         is_kept = options.get("method") == "fast" and options.get("iterations") != 0
         return {
             "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
@@ -74,7 +74,7 @@ class Judgement(NamedTuple):
         }
 
     def tell(self) -> list[str]:
-        """Tell what is wrong with it; that, a line each. What is only good to know is a warning."""
+        """Report the mesh's problems and return them, a line each; remarks are warnings."""
         problems: list[str] = self.numbers.get("problems", [])
         for remark in self.numbers.get("remarks", []):
             warning(f"{self.path}: {remark}")
@@ -84,10 +84,10 @@ class Judgement(NamedTuple):
             violated(line)
         if self.source is None or self.result is None:
             return wrong
-        known = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
+        known = ("overlap", "manifold") if problems else ("overlap",)  # reported above, with numbers of cells or nodes
         unmet = {name: words for name, words in self.result.violated.items() if name not in known}
         measured = self.measured
-        if not self.is_checked:  # what makes the numbers above meaningless
+        if not self.is_checked:  # only what makes the numbers above meaningless
             unmet, measured = {name: words for name, words in unmet.items() if name == "mask"}, {}
         return [*wrong, *tell_violated(self.result._replace(violated=unmet), measured, self.source.mask_word).values()]
 
@@ -96,19 +96,19 @@ def judge(
     mesh: Path, image: Path | None = None, mask: Path | None = None, labels: Path | None = None,
     *, part: ImagePart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
 ) -> Judgement:  # fmt: skip
-    """Measure a mesh's file: its shape, and on an image, with a mask and labels beside it, how well its cells fit.
+    """Measure a mesh's file: its shape and, given an image, mask and labels, the fit of its cells.
 
-    With `check`, also whether it is a mesh, and, on an image, what its run was asked for.
+    With `check`, also check that it is a valid mesh and, given an image, that it meets its run's requirements.
 
     Raises
     ------
     InputError
-        Files that cannot be read, or without those that they belong to.
+        Files cannot be read, or the files that they belong to are missing.
     """
     if image is None and (mask is not None or labels is not None):
-        raise InputError("`mask` and `labels`: give the `image`, too, on whose voxels they are compared")
+        raise InputError("`mask` and `labels`: need an `image`, on whose voxels they are compared")
     if label_names is not None and labels is None:
-        raise InputError("`label_names`: there are no `labels`")
+        raise InputError("`label_names`: needs `labels`")
     loaded = read_mesh(mesh)
     shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
@@ -130,7 +130,7 @@ def judge(
 
 
 def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
-    """What the mesh is measured on: the files named here, weighed as the mesh's file says that they were."""
+    """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = table_in(loaded, "inputs")
     level, tension, weight = (_number(inputs.get(name)) for name in ("background", "smooth_interfaces", "label_weight"))
     weights = inputs.get("weights")
@@ -147,7 +147,7 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
-    """The numbers that the mesh's run gave to labels that it merged; none for labels that have them already."""
+    """Return the numbers that the mesh's run gave to merged labels; none if the labels have them already."""
     table, sums = inputs.get("merged"), inputs.get("sha256")
     numbers = {
         int(old): new
@@ -160,7 +160,7 @@ def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
 
 
 def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
-    """How well the cells fit the image; the mesh as the result of a run; how well mask, labels and image are met."""
+    """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to mask and labels."""
     source, mesh, of_cell = cast(Source, came.source), came.loaded.mesh, came.loaded.cell_data.get("label")
     fit = image_fit(source.image, mesh)
     result = judged(mesh, source.content, of_cell, **came.requirements)
@@ -173,14 +173,14 @@ def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]
 
 
 def _number(value: Any) -> float | None:
-    """A number of a mesh's file; None for anything else."""
+    """Return a number from a mesh's file; None for anything else."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def _checked(came: Judgement) -> tuple[list[str], list[str]]:
-    """What is wrong with a mesh; and if nothing is, what is no fault, and yet good to know.
+    """Return the problems of a mesh; without any, remarks that are no faults.
 
-    That are interfaces of labels which are not manifolds; of a run that smoothed them, it is wrong.
+    Non-manifold interfaces of labels are remarks, but problems of a run that smoothed interfaces.
     """
     mesh, image = came.loaded.mesh, None if came.source is None else came.source.contrasts[0]
     problems = check_mesh(mesh, image, is_whole=not came.is_masked, is_filled=came.is_filled)
@@ -194,6 +194,6 @@ def _checked(came: Judgement) -> tuple[list[str], list[str]]:
 
 
 def _names(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> dict[str, dict[int, str]]:
-    """What those of the labels that have a name are called, as "label_names"; nothing if none has."""
+    """Return the names of the labels that have one, as "label_names"; empty if none has."""
     of_rows = {row.label: names[row.label] for row in rows if row.label in names}
     return {"label_names": of_rows} if of_rows else {}

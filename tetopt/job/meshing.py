@@ -1,4 +1,4 @@
-"""The optimised mesh of a run: in one piece, or in parts; a target error takes several runs in turn."""
+"""The optimised mesh of a run: in one piece, or in parts; a target error takes several successive runs."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from tetopt.report.tables import curving_in_words
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.system.files import check_space
 
-CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
-LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
-START_WORDS = "making the initial mesh"
+CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
+LONG_SECONDS = 3.0  # above it, the kernels were compiled, not loaded
+START_WORDS = "building the initial mesh"
 
 
 def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
-    """The optimised mesh; `begin` is when the run began, as of `time.perf_counter`."""
+    """Build the optimised mesh; `begin` is the run's start time by `time.perf_counter`."""
     seconds = task.plan.job.max_seconds
     ends = None if seconds is None else begin + seconds
     came = task.plan.division.chosen(_in_one_piece, _in_parts)(task, stop, begin, ends)
@@ -56,7 +56,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
 
 
 def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
-    """In this process, all iterations in one round; towards an error, or of order 2, several runs in turn."""
+    """Run all iterations in this process, in one round; a target error, or order 2, takes several successive runs."""
     job, content, options = task.plan.job, task.source.content, task.plan.engine_options
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
@@ -75,7 +75,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
         started("optimise", "optimising", options["iterations"])
         result = watched(run, initial, options["iterations"], ends, stop, limit)
         _say_search(task, len(begun), result)
-        if job.target_error is not None or job.order == 2:  # of which there may be a next run
+        if job.target_error is not None or job.order == 2:  # a next run may follow
             started("start", START_WORDS)
         return result
 
@@ -89,7 +89,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     if result.curving is not None:
         note(curving_in_words(result.curving))
     elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
-        note("`start`: its curved edges become straight, as neither labels nor a mask say where their nodes belong")
+        note("`start`: curved edges become straight, as there are no labels or mask for their nodes to follow")
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))
@@ -98,7 +98,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
 
 
 def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
-    """By workers, which take the fields of the cells as well."""
+    """Run in parts on workers, which also compute the cell fields."""
     loaded = time.perf_counter() - begin
 
     def check(initial: Mesh) -> None:
@@ -109,17 +109,17 @@ def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | 
     parted, n_bytes = run_in_parts(task, check, stop, ends)
     seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
     fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
-    predicted = {"prediction": {"task_bytes": n_bytes}}  # of each worker's largest task
+    predicted = {"prediction": {"task_bytes": n_bytes}}  # for each worker's largest task
     return Meshed(parted.result, parted.result.initial, seconds, predicted, fields, is_kept=True)
 
 
 def _check_room(task: Task, initial: Mesh) -> None:
-    """InputError if the disk has no room for as many cells as the initial mesh has."""
+    """Raise InputError if the disk has no room for the cells of the initial mesh."""
     check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
 
 
 def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
-    """InputError for what the writer would refuse after the run, as far as the initial mesh can tell."""
+    """Raise InputError for what the writer would refuse after the run, as far as the initial mesh shows."""
     job = task.plan.job
     if not has_model(job) and job.output.suffix.lower() == ".vtu":
         return
@@ -131,7 +131,7 @@ def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -
 
 
 def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
-    """The user's; InputError if the image alone, or the mesh to begin with, needs more."""
+    """Return the user's limit; raise InputError if the image alone, or the initial mesh, needs more."""
     job = task.plan.job
     if job.max_gb is None:
         return None
@@ -146,14 +146,14 @@ def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
     make(progress)
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:
-        note(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+        note(f"kernels compiled in {seconds:.0f} s; later runs on similar images load them from the cache")
 
 
 def watched(
     run: Run, initial: Mesh, iterations: int, ends: float | None, stop: Callable[[], bool],
     limit: MemoryLimit | None = None,
 ) -> MeshingResult:  # fmt: skip
-    """A run whose records are told, ended in good order at a time, before a limit of memory, or when `stop` says so."""
+    """Run and report the records; end early at a time, before a limit of memory, or once `stop` returns true."""
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
 
     def is_stopped() -> bool:
@@ -163,7 +163,7 @@ def watched(
         progress(f"iteration {row.iteration} of {iterations}: E {row.E:.4f}", row)
 
     result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
-    if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
+    if iterations == 0:  # the initial mesh itself, not with nodes rounded to the sampling grid
         result = result._replace(mesh=initial)
     if result.ended == "stopped" and not stop():
         result = result._replace(ended="max_gb")
@@ -175,19 +175,19 @@ def watched(
 
 
 def _say_search(task: Task, number: int, result: MeshingResult) -> None:
-    """A line for a run of several, which go on until one is near to an error, or to a number of nodes of order 2."""
+    """Report one of several runs, repeated until the error, or the number of nodes of order 2, is close enough."""
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
         fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
         note(
-            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance in cells; "
-            f"{ERROR_REACHED * target:.4g} to {target:.4g} is near enough"
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance within cells; "
+            f"accepted: {ERROR_REACHED * target:.4g} to {target:.4g}"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
-            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes with those in the middle of edges, of "
-            f"{job.nodes}; {NODES_NEAR:.0%} off is near enough"
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes with mid-edge ones, of "
+            f"{job.nodes}; accepted: within {NODES_NEAR:.0%}"
         )
 
 

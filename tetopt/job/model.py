@@ -1,4 +1,4 @@
-"""From a mesh to a file for a solver: what runs, conversions and simulations have in common."""
+"""From a mesh to a solver's file: code shared by runs, conversions and simulations."""
 
 from __future__ import annotations
 
@@ -51,30 +51,30 @@ from tetopt.model.sets import (
 )
 from tetopt.system.files import kept_places
 
-REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces that hold sets
-SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
-# Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
+REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
+SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
+# Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the cells.
 MANY_INTERFACES = 24
-INTERFACE_PREFIX = "interface_"  # of the names of facet sets between two labels
-SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
+INTERFACE_PREFIX = "interface_"  # of names of facet sets between two labels
+SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with one material per cell (tests/benchmarks)
 
 
 def check_solver_options(output: Path, solver: SolverOptions, has_materials: bool = False) -> None:
-    """InputError for what is wrong whatever the mesh may be, raised before the work starts.
+    """Check the options that do not depend on the mesh, before the work starts.
 
     Raises
     ------
     InputError
-        A suffix, mapping, number of bins, unit or convention that there is not; what needs moduli without any.
+        An invalid suffix, mapping, number of bins, unit or convention; options that need moduli without any.
     """
     form = format_of(output)
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
         raise InputError(
-            f"{output}: holds the boundary alone; leave out `young`, `bins`, `sets`, `written_sets` and `loads`"
+            f"{output}: contains only the boundary; leave out `young`, `bins`, `sets`, `written_sets` and `loads`"
         )
     check_model_options(solver, has_materials)
     if solver.average is not None and solver.young is None:
-        raise InputError("`average`: there is no `young`")
+        raise InputError("`average`: needs `young`")
     if solver.units not in STRESS_UNITS:
         raise InputError(f"`units`: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.space not in SPACES:
@@ -88,18 +88,18 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
 
 
 def check_model_options(options: ModelOptions, has_materials: bool) -> None:
-    """InputError for what is wrong whatever mesh and file may be; `has_materials`: the mesh's file does, or an image.
+    """Check the options that depend on neither mesh nor file; `has_materials` is that of the mesh's file, or an image.
 
     Raises
     ------
     InputError
-        A mapping, average, number of bins or order that there is not; what needs moduli without any.
+        An invalid mapping, average, number of bins or order; options that need moduli without any.
     """
     for name, mapping in (("young", options.young), ("nu", options.nu), ("density", options.density)):
         if mapping is not None:
             _check_mapping(mapping, name)
             if options.young is None and not has_materials:
-                raise InputError(f"`{name}`: there is no `young`")
+                raise InputError(f"`{name}`: needs `young`")
     parse_average(options.average or DEFAULT_AVERAGE)
     parsed_bins(options.bins)
     parsed_groups(options.written_sets)
@@ -108,7 +108,7 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
 
 
 def _check_mapping(text: str, name: str) -> None:
-    """InputError that names the option, for a mapping that is none."""
+    """Raise InputError with the option's name for an invalid mapping."""
     try:
         parse_any_mapping(text, name)
     except InputError as error:
@@ -116,7 +116,7 @@ def _check_mapping(text: str, name: str) -> None:
 
 
 def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
-    """Number and spacing of bins, from "K", "K:quantile" or "K:log"."""
+    """Parse "K", "K:quantile" or "K:log" into the number and spacing of bins."""
     if text is None:
         return None, "equal"
     count, _, spacing = text.partition(":")
@@ -127,7 +127,7 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
 
 
 def parsed_groups(text: str | None) -> tuple[str, ...]:
-    """Which of `SET_GROUPS` are to be written, from "labels,interfaces,boundary", "all", or "none"."""
+    """Parse the `SET_GROUPS` to write, from "labels,interfaces,boundary", "all", or "none"."""
     if text in (None, "all"):
         return SET_GROUPS
     words = [] if text == "none" else [word.strip() for word in text.split(",")]
@@ -142,11 +142,11 @@ def solver_model(
     mesh: Mesh, image: Image | None, solver: ModelOptions, cell_data: dict[str, NDArray], about: dict[str, Any],
     known_sets: Sets,
 ) -> Model:  # fmt: skip
-    """The model that the options ask for, of a mesh with the sets `known_sets`."""
+    """Build the model of a mesh with the sets `known_sets`, with the options' materials and loads."""
     young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
     is_of_file = solver.young is None and "young" in cell_data
     if not is_of_file and nu is None and "nu" in cell_data:
-        note(f"nu: of `young` or {DEFAULT_NU:g}; what the mesh's file has is left")
+        note(f"nu: from `young`, or {DEFAULT_NU:g}; the values in the mesh's file are ignored")
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     model = build_model(
@@ -158,7 +158,7 @@ def solver_model(
 
 
 def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
-    """The mesh's file without what a solver found on it, if moduli, densities or loads are to be others; a line."""
+    """Return the mesh's file without a solver's results if moduli, densities or loads change; note the results."""
     if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
         return loaded
     names = [name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)]
@@ -166,14 +166,14 @@ def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
     if not names and len(texts) == len(loaded.field_data):
         return loaded
     note(
-        f"left out, as they are of other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; tetopt fem "
-        "finds them anew"
+        f"dropped results computed with other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; "
+        "tetopt fem computes them again"
     )
     return without_results(loaded)._replace(field_data=texts)
 
 
 def loads_of(loaded: MeshFile) -> list[str]:
-    """The loads that a file of ours holds, see `tetopt.model.file.loads_in`; a line where they are left out."""
+    """Return the loads in a file of tetopt's, see `tetopt.model.file.loads_in`; note dropped loads."""
     loads, lost = loads_in(loaded)
     if lost:
         note(lost)
@@ -190,19 +190,19 @@ def all_sets(
     kept: Iterable[str] = (),
     is_told: bool = True,
 ) -> Sets:
-    """`tetopt.model.file.sets_beside`; a line for each of the mesh's own that had to be called otherwise."""
+    """Call `tetopt.model.file.sets_beside`, and note each renamed set of the mesh."""
     sets, renamed = sets_beside(mesh, box, fields, own, names, former, kept)
     if is_told:
         for old, new in renamed.items():
-            note(f'the mesh came with a set "{old}" of its own: it is {new} here')
+            note(f'renamed set "{old}" from the input mesh to "{new}" (name already in use)')
     return sets
 
 
 def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
-    """The model with those sets that its file is to get; a line if interfaces are left out unasked.
+    """Return the model with the sets to write; note interfaces that are left out by default.
 
-    Of the sets that every mesh has those of `written_sets` are written, by default all, but into a file of VTK's no
-    more interfaces than `MANY_INTERFACES`. Others, and those that loads name, always are.
+    Of the sets that every mesh has, those of `written_sets` are written, by default all, except more than
+    `MANY_INTERFACES` interfaces in a VTK file. Other sets, and those that loads name, are always written.
     """
     groups = set(parsed_groups(options.written_sets))
     labels = labels_of(model.cell_data, len(model.mesh.cells))
@@ -213,8 +213,8 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     interfaces = between & set(model.sets.facets)
     if options.written_sets is None and output.suffix.lower() in VTK_SUFFIXES and len(interfaces) > MANY_INTERFACES:
         note(
-            f"{len(interfaces)} interfaces are not written as sets, which `written_sets` all does; convert, fem and "
-            "view have them anyway, from the cells' labels"
+            f"{len(interfaces)} interfaces are not written as sets (`written_sets` all writes them); convert, fem and "
+            "view derive them from the cells' labels"
         )
         groups.discard("interfaces")
     left = set()
@@ -231,7 +231,7 @@ def model_of_file(
     loaded: MeshFile, image: Image | None, options: ModelOptions, about: dict[str, Any], box: Box | None,
     has_units: bool = True,
 ) -> Model:  # fmt: skip
-    """The model that the options ask for, of a mesh's file and what it alone has; and a warning for odd units."""
+    """Build the model of a mesh's file, keeping the file's own data, with the options; warn of implausible units."""
     mesh, fields = loaded.mesh, loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image))
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
@@ -249,17 +249,17 @@ def model_of_file(
 def check_early(
     output: Path, solver: SolverOptions, ndim: int, low: float, build: Callable[[SolverOptions], Model]
 ) -> None:
-    """InputError for what would be refused after the optimisation, as far as the initial mesh can tell.
+    """Raise InputError for what would be refused after the optimisation, as far as the initial mesh shows.
 
-    `low` is the image's least intensity; `build` makes a model of the initial mesh. Further sets, and interfaces, may
-    have members in the final one alone: of them, and of loads on them, only the words and names are looked at.
+    `low` is the image's least intensity; `build` makes a model of the initial mesh. Requested sets, and interfaces, may
+    be empty until the final mesh: of these, and of loads on them, only words and names are checked.
     """
     requests = [parse_set(text, ndim) for text in solver.sets or ()]
     for request in requests:
         if request.kind == "below" and request.vectors[0][0] <= low:
             raise InputError(
-                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, the image begins at "
-                f"{low:g}"
+                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, as the image's "
+                f"minimum is {low:g}"
             )
     names = {name for request in requests for name in request.names()}
     loads = [parse_load(text, ndim) for text in solver.loads or ()]
@@ -277,14 +277,14 @@ def check_early(
     for load in loads:
         if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
             raise InputError(
-                f'load: the facets of "{load.set_name}" lie between two cells, where nothing outside can act '
-                f"({load.kind}); take a set of the boundary, mesh one side alone (`mask`), or move the set"
+                f'load: the facets of "{load.set_name}" lie between two cells, where no outside force can act '
+                f"({load.kind}); use a set on the boundary, mesh one side alone (`mask`), or move the set"
             )
     file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
 
 
 def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
-    """The model with a facet and a cell under each name of a set that is asked for, so that a writer refuses it now."""
+    """Return the model with a facet and a cell in each requested set, so that a writer refuses bad names now."""
     facets, cells = dict(model.sets.facets), dict(model.sets.cells)
     for request in requests:
         *of_cells, of_facets = request.names()
@@ -294,7 +294,7 @@ def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
 
 
 def warn_of_units(model: Model) -> None:
-    """A line for each quantity that seems to be in another unit than is expected."""
+    """Warn of each quantity that seems to be in another unit than expected."""
     for words in odd_units(model):
         warning(words)
 
@@ -302,56 +302,56 @@ def warn_of_units(model: Model) -> None:
 def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     """Write the file."""
     if model.materials is not None and len(model.materials.young) > SLOW_MATERIALS and output.suffix.lower() == ".inp":
-        note(f"{len(model.materials.young)} materials make CalculiX some three times slower; `bins` 32 groups them")
+        note(f"{len(model.materials.young)} materials make CalculiX about three times slower; `bins` 32 groups them")
     save_model(output, model, space=solver.space, units=solver.units)
 
 
 def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Path | None:
-    """Keep an optimised mesh beside its file until that is written, whatever may end the process before; the place."""
+    """Keep an optimised mesh beside its file until that is written, in case the process ends; return the path."""
     early = next(kept_places(output, ".vtu"))
     try:
         data = {} if labels is None else {"label": labels}
         save_mesh(early, mesh, data, order=1 if mesh.midpoints is None else 2)
     except (OSError, MemoryError) as error:
-        note(f"the optimised mesh cannot be kept before its file is written: {error_words(error)}")
+        note(f"cannot save a copy of the optimised mesh before its file is written: {error_words(error)}")
         return None
     return early
 
 
 def drop_early(early: Path) -> None:
-    """Remove what `keep_early` kept, as the mesh is elsewhere by now."""
+    """Remove the file of `keep_early`, as the mesh is saved elsewhere."""
     try:
         early.unlink(missing_ok=True)
     except OSError as error:
-        note(f"{early}: holds the nodes and cells of the mesh, too; it cannot be removed: {error.strerror}")
+        note(f"{early}: a copy of the mesh, which cannot be removed: {error.strerror}")
 
 
 def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:
-    """Keep an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
+    """Save an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
 
-    `build` makes the model to keep; if that fails, too, the mesh is kept alone, as it is `early`, if that is a place.
+    `build` makes the model to keep; if that also fails, the mesh alone is kept, as in `early` if that is a path.
 
     Raises
     ------
     InputError
-        If `error` is one that the user can mend; it says where the mesh is.
+        If the user can fix `error`; the message says where the mesh is.
     """
     places = chain([] if early is None else [early], kept_places(output, ".vtu"))
     kept = _kept_mesh(places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
-    where = "could not be kept anywhere" if kept is None else f"is in {kept}: go on from there with tetopt convert"
+    where = "could not be saved anywhere" if kept is None else f"is in {kept}: continue from there with tetopt convert"
     if isinstance(error, InputError | OSError | MemoryError):
         raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
     note(f"the optimised mesh {where}")
 
 
 def _kept_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
-    """The first place where one of the ways to save a mesh does so, or where it was saved before."""
+    """Return the first place where one of the ways to save a mesh succeeds, or where it was saved before."""
     for path in places:
         for save in ways:
             try:
                 save(path)
-            except Exception as error:  # told; what ended the run before is raised in the end
-                note(f"{path}: the optimised mesh cannot be kept here: {error_words(error)}")
+            except Exception as error:  # noted; the earlier error is raised at the end
+                note(f"{path}: the optimised mesh cannot be saved here: {error_words(error)}")
             else:
                 return path
         if path.exists():

@@ -1,8 +1,7 @@
-"""What can be asked of a run: each option once, with its type, its unit, its default, and a line of help.
+"""Options of a run: each once, with its type, its unit, its default, and a line of help.
 
-Records are options that belong together; commands that take some of them alone share these. Of all of them a `Job` is
-made. What a message, or a help, says of an option has its name between backticks, which the command line turns into
-what it calls it.
+Records group options that belong together, and commands share them; a `Job` has all of them. Messages and help texts
+put an option's name between backticks, which the command line replaces by its own name.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ from tetopt.start.lattice import Kind
 
 Lattice = Literal[Kind, "octree"]
 Method = Literal["fast", "paper"]
-DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; on small images a graded mesh has fewer
+DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; a graded mesh of a small image has fewer
 
 
 class Option(NamedTuple):
-    """What is said of an option beside its type and its default."""
+    """Description of an option, in addition to its type and default."""
 
-    metavar: str | None  # what its value is called; None of a switch, and where choices speak for themselves
+    metavar: str | None  # placeholder of its value; None for switches and choices
     text: str  # its help
-    name: str = ""  # on the command line, if that is not its own with hyphens
+    name: str = ""  # on the command line, if it differs from its own name with hyphens
     least: int | None = None
-    letter: str = ""  # its short name there
+    letter: str = ""  # its short name on the command line
     is_argument: bool = False
 
 
@@ -52,43 +51,42 @@ JsonOption = Annotated[Path | None, Option("FILE", "Write every number here.", "
 ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
 AVERAGE_OPTION = Option(
     "WORD",
-    "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
-    f"and harmonic); or gauss (around each Gauss point of quadratic cells), nodes (linear between nodes); by default "
-    f"{DEFAULT_AVERAGE}.",
+    "Average of a cell's voxel moduli: mean (the paper's), geometric, harmonic, power:P, hill (between mean and "
+    "harmonic); or gauss (one per Gauss point of quadratic cells), nodes (linear between nodes) (default "
+    f"{DEFAULT_AVERAGE}).",
 )
 LabelNamesOption = Annotated[
     Path | None,
     Option(
         "TABLE",
-        "Names and colours of labels: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS' dseg.tsv, or CSV; the mesh's file keeps "
-        "them.",
+        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS dseg.tsv, or CSV.",
     ),
 ]
-SpaceOption = Annotated[str, Option("ras|lps", "Convention of the file's coordinates.")]
+SpaceOption = Annotated[str, Option("ras|lps", "Coordinate convention of the file.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoxPart:
-    """Which part of a volume file is read."""
+    """Selected part of a volume file."""
 
     volume: Annotated[int | None, Option("K", "Volume of a 4-D file, from 0.")] = None
-    crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep these voxels, half open; an end may be empty.")] = None
+    crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep these voxels, half-open; an end may be empty.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePart(BoxPart):
-    """Which part of an image file is read; a slice of it is an image in 2-D."""
+    """Selected part of an image file; a slice is a 2-D image."""
 
-    slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, in 2-D; for example k=90.", "slice")] = None
+    slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, as a 2-D image; for example k=90.", "slice")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledPart(ImagePart):
-    """Which part of an image file is read, and what gives labels to a mesh that was made without."""
+    """Selected part of an image file, and labels for a mesh without them."""
 
     labels: Annotated[
         Path | None,
-        Option("LABELS", "Label image: a cell gets the label of most of its voxels, for modulus mappings and sets."),
+        Option("LABELS", "Label image: each cell gets its voxels' majority label, for modulus mappings and sets."),
     ] = None
 
 
@@ -97,109 +95,105 @@ WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
 
 @dataclass(frozen=True, kw_only=True)
 class RegionOptions:
-    """Which region is meshed, and what counts there."""
+    """Region to mesh, with its labels and weights."""
 
     mask: Annotated[
-        Path | None, Option("MASK", "Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface.")
+        Path | None, Option("MASK", "Mesh only this region (0/1, or 0 to 1), with its boundary on the mask's surface.")
     ] = None
     background: Annotated[
-        str | None, Option("VALUE|auto", "Leave out what is up to VALUE and reaches the box: the air.")
+        str | None, Option("VALUE|auto", "Leave out the air: voxels up to VALUE connected to the box's sides.")
     ] = None
     keep_components: Annotated[bool, Option(None, "Keep small components of the mesh that the mask does not have.")] = (
         False
     )
-    labels: Annotated[Path | None, Option("LABELS", "Label image: each cell is to be of one label.")] = None
+    labels: Annotated[Path | None, Option("LABELS", "Label image: each cell gets one label.")] = None
     tissues: Annotated[
         Path | None,
-        Option("FILE,...", "Tissue probabilities instead of labels: a file each, or one in 4-D; 0 is what they leave."),
+        Option("FILE,...", "Tissue probabilities instead of labels: one file each, or one 4-D file; 0 is the rest."),
     ] = None
     merge: Annotated[
         str | None,
         Option(
             "GROUPS",
-            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a file of '
-            "these, .toml or .csv.",
+            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a .toml or '
+            ".csv file.",
         ),
     ] = None
-    weights: Annotated[str | None, Option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (
-        None
-    )
+    weights: Annotated[str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")] = None
     smooth_interfaces: Annotated[
         float | None,
-        Option("W", "Tension of surfaces between labels, voxels, to 10 (default 0.3; 0 leaves voxels their stairs)."),
+        Option("W", "Smoothing of surfaces between labels, voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
     ] = None
     free_volumes: Annotated[
-        bool, Option(None, "Labels thinner than cells may lose volume; by default cells are theirs for as much.")
+        bool, Option(None, "Let labels thinner than cells lose volume, which is preserved by default.")
     ] = False
     label_weight: Annotated[
-        float | None, Option("W", "How much the labels count beside the first IMAGE (default 1).")
+        float | None, Option("W", "Weight of the labels relative to the first IMAGE (default 1).")
     ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContentOptions(ImagePart, RegionOptions):
-    """What of an image is meshed, and what lies beside it."""
+    """Meshed part of an image, and the files beside it."""
 
-    panel: ClassVar[str] = "What is meshed"
+    panel: ClassVar[str] = "Region and labels"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions(ContentOptions):
-    """What `tetopt mesh` meshes."""
+    """Inputs of `tetopt mesh`."""
 
     images: Annotated[
         list[Path],
-        Option(
-            "IMAGE...", f"{IMAGE_FILES} Further ones are contrasts, taken to the first one's grid.", is_argument=True
-        ),
+        Option("IMAGE...", f"{IMAGE_FILES} Further images are contrasts, resampled to the first.", is_argument=True),
     ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SizeOptions:
-    """How many nodes there are, and how large cells may be."""
+    """Number of nodes, and sizes of cells."""
 
     panel: ClassVar[str] = "Number and size of cells"
     nodes: Annotated[
         int | None,
         Option(
             "N",
-            "Wanted number of nodes, with `order` 2 mid-edge ones too "
-            f"(default as sizes take, or {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).",
+            "Target number of nodes, with `order` 2 including mid-edge nodes "
+            f"(default: as sizes require, or {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).",
         ),
     ] = None
     target_error: Annotated[
-        float | None, Option("T", "As many nodes as leave this fraction of the image's variance in cells, instead.")
+        float | None, Option("T", "Instead, use as many nodes as leave this fraction of the image's variance.")
     ] = None
-    size_min: Annotated[float | None, Option("MM", "No edge is split into shorter ones.")] = None
+    size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = None
     edge_size: Annotated[
-        float | None, Option("MM", "Target for the usual edge: longer ones are split as far as nodes go.")
+        float | None, Option("MM", "Target edge length: longer edges are split while nodes remain.")
     ] = None
     edge_max: Annotated[
-        float | None, Option("MM", "No longer edge is made (default 1.4 x a uniform mesh's; with `edge_size` none).")
+        float | None, Option("MM", "Maximum edge length (default 1.4 x a uniform mesh's; with `edge_size` none).")
     ] = None
     gradation: Annotated[
-        float | None, Option("G", "How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default).")
+        float | None, Option("G", "Gradation of sizes: each spans 1/G blocks, 0.05 (gentle) to 1 (default).")
     ] = None
     cells_across: Annotated[
-        float | None, Option("N", "Cells across each label where it is thin: edges of its local thickness / N.")
+        float | None, Option("N", "Number of cells across thin labels: edges of the local thickness / N.")
     ] = None
     label_size: Annotated[
         str | None,
         Option(
             "LABEL=SIZE,...",
-            'Usual edge by label or name, mm, or a part of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6"; or '
-            "a file .toml or .csv of these.",
+            'Target edge by label or name, mm, or as a part of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
+            "or a .toml or .csv file.",
         ),
     ] = None
-    sizing: Annotated[Path | None, Option("SIZES.nii.gz", "Usual edge by place, mm; 0 or less: as elsewhere.")] = None
+    sizing: Annotated[Path | None, Option("SIZES.nii.gz", "Image of target edges, mm; 0 or less: no target.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class StartOptions:
-    """The mesh that a run begins with."""
+    """The initial mesh of a run."""
 
-    panel: ClassVar[str] = "The mesh it begins with"
+    panel: ClassVar[str] = "Initial mesh"
     lattice: Annotated[
         Lattice | None,
         Option(
@@ -208,16 +202,16 @@ class StartOptions:
             "in 2-D criss-cross.",
         ),
     ] = None
-    uniform: Annotated[bool, Option(None, "The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")] = False
-    spacing: Annotated[float | None, Option("MM", "A uniform lattice of this spacing.")] = None
+    uniform: Annotated[bool, Option(None, "Use the paper's uniform lattice, bcc (criss-cross in 2-D).")] = False
+    spacing: Annotated[float | None, Option("MM", "Use a uniform lattice of this spacing.")] = None
     start: Annotated[
-        Path | None, Option("MESH", "Improve this mesh, its boundary kept, instead of making a new one.")
+        Path | None, Option("MESH", "Improve this mesh and keep its boundary, instead of building a new one.")
     ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How the mesh is optimised."""
+    """Settings of the optimisation."""
 
     panel: ClassVar[str] = "Optimisation"
     k_D: Annotated[
@@ -238,14 +232,14 @@ class EngineOptions:
         ),
     ] = None
     boundary: Annotated[
-        Boundary | None, Option(None, "What the boundary's nodes may do (default slide; with `start` fixed).")
+        Boundary | None, Option(None, "Motion of boundary nodes (default slide; with `start` fixed).")
     ] = None
     method: Annotated[
-        Method, Option(None, "fast: gradients, flips, a minimum dihedral angle; paper: the scheme of the paper.")
+        Method, Option(None, "fast: gradients, flips, a minimum dihedral angle; paper: the paper's scheme.")
     ] = "fast"
     shape_power: Annotated[
         float | None,
-        Option("P", f"Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default {SHAPE_POWER:g})."),
+        Option("P", f"Fast method: 1 is the paper's E_G; up to 10 penalise flat cells (default {SHAPE_POWER:g})."),
     ] = None
     min_dihedral: Annotated[
         float | None,
@@ -255,7 +249,7 @@ class EngineOptions:
         int | None,
         Option(
             "T",
-            "Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
+            "Paper's method: retessellate in the first T iterations (default half; all for k_D = 0).",
             "n-t",
             least=0,
         ),
@@ -264,41 +258,43 @@ class EngineOptions:
         Retessellate | None,
         Option(
             None,
-            "Paper's method: Delaunay anew in the first n_t iterations (the default), whenever it lowers E, never.",
+            "Paper's method, Delaunay tessellation: in the first n_t iterations (default), if it lowers E, or never.",
         ),
     ] = None
-    threads: Annotated[int | None, Option("N", "Threads; the result is the same for any number.")] = None
-    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds with the mesh reached.")] = None
-    max_gb: Annotated[float | None, Option("GB", "Stop with the mesh reached before more than GB GB are taken.")] = None
+    threads: Annotated[int | None, Option("N", "Number of threads; the result does not depend on it.")] = None
+    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the mesh so far.")] = None
+    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the mesh so far.")] = None
 
 
-WorkersOption = Annotated[int | None, Option("N", "Tasks at a time, at most; of a `cluster` its jobs.", least=1)]
+WorkersOption = Annotated[
+    int | None, Option("N", "Maximum number of tasks, or of a `cluster`'s jobs, at a time.", least=1)
+]
 SchedulerOption = Annotated[
-    str | None, Option("ADDRESS", "A scheduler of dask's that runs, with its workers: tcp://host:8786.")
+    str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
 ]
 ClusterOption = Annotated[
-    Path | None, Option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), as dask-jobqueue is configured.")
+    Path | None, Option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), configured as for dask-jobqueue.")
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PartsOptions:
-    """How a mesh is made in parts, and by whom."""
+    """Settings of meshing in parts, and its workers."""
 
-    panel: ClassVar[str] = "Beyond one memory"
+    panel: ClassVar[str] = "Meshing in parts"
     parts: Annotated[
         int | None,
-        Option("K", "In K parts or more, each on its own voxels (default 1, or as many as memory asks for).", least=1),
+        Option("K", "Mesh in K parts or more, each with its own voxels (default 1, or as memory requires).", least=1),
     ] = None
     workers: WorkersOption = None
-    worker_gb: Annotated[float | None, Option("GB", "Memory of each worker on this machine, enforced.")] = None
+    worker_gb: Annotated[float | None, Option("GB", "Memory limit of each worker on this machine.")] = None
     scheduler: SchedulerOption = None
     cluster: ClusterOption = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
-    """What a solver is told besides the mesh."""
+    """Materials, sets and loads for a solver."""
 
     panel: ClassVar[str] = "For the solver"
     young: Annotated[
@@ -306,22 +302,23 @@ class ModelOptions:
         Option(
             "MAPPING",
             'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
-            'by label "1=2.1,liver=1.9,*=5", or a file .toml or .csv of such columns.',
+            'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file of such columns.',
         ),
     ] = None
-    nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
+    nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, in the same forms (default {DEFAULT_NU:g}).")] = None
     density: Annotated[
-        str | None, Option("MAPPING", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")
+        str | None, Option("MAPPING", "Density, kg/m3, in the same forms (water: 1000); needed for gravity.")
     ] = None
     average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
-        str | None, Option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
+        str | None,
+        Option("K[:quantile|:log]", "Group cells into K materials: bins of equal width, equal count, or log."),
     ] = None
     sets: Annotated[
         list[str] | None,
         Option(
             "NAME=...",
-            "A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
+            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
             "set",
         ),
     ] = None
@@ -329,7 +326,7 @@ class ModelOptions:
         str | None,
         Option(
             "GROUP,...",
-            "Which sets of every mesh the file gets: labels, interfaces, boundary; or all, or none.",
+            "Standard sets to write: labels, interfaces, boundary; or all, or none.",
             "sets",
         ),
     ] = None
@@ -338,7 +335,7 @@ class ModelOptions:
         Option(
             "...",
             "compress:5%, hold:SET, move:SET:X,Y,Z (mm, or free), pressure:SET:P (kPa, inwards), traction:SET:X,Y,Z "
-            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... is in step 2 alone. "
+            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... acts in step 2 only. "
             "May be repeated.",
             "load",
         ),
@@ -348,65 +345,65 @@ class ModelOptions:
         int | None,
         Option(
             "1|2",
-            "2: quadratic cells, whose edges a run with labels or a mask curves along their surfaces; 1: linear. By "
-            "default as the mesh read, else 1.",
+            "2: quadratic cells, curved along the surfaces of labels or a mask; 1: linear cells "
+            "(default: as in the input mesh, else 1).",
         ),
     ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions(ModelOptions):
-    """What the file tells a solver besides the mesh."""
+    """Settings of a solver's file."""
 
-    nonlinear: Annotated[bool, Option(None, "The step is of large deformation (.inp; FEBio's always is).")] = False
+    nonlinear: Annotated[bool, Option(None, "Use large deformation in the step (.inp; always in FEBio).")] = False
     units: Annotated[str, Option("kPa|MPa", "Unit of stress in the file; `young` is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions:
-    """What a run writes."""
+    """Outputs of a run."""
 
     panel: ClassVar[str] = ""  # beside those of the command
     output: Annotated[Path, Option("MESH", f"The mesh to write: {', '.join(FORMATS)}.", letter="o")]
     json_path: JsonOption = None
     figures: Annotated[
-        Path | None, Option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder, made if need be.")
+        Path | None, Option("DIR", "Folder for slice.png, rho.png, energies.png and others; created if needed.")
     ] = None
     force: ForceOption = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(SolverOptions, EngineOptions, StartOptions, SizeOptions, ContentOptions):
-    """What can be asked of the runs of many subjects: all but images, outputs, and who works."""
+    """Options of the runs of many subjects: all except images, outputs and workers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JobOptions(OutputOptions, SolverOptions, PartsOptions, EngineOptions, StartOptions, SizeOptions, SourceOptions):
-    """Every option of a run; that they go together is for `tetopt.job.plan` to say."""
+    """Every option of a run; `tetopt.job.plan` checks that they are consistent."""
 
 
 def stated_part(part: ImagePart) -> dict[str, int | str | None]:
-    """The part of an image as files of numbers state it."""
+    """Return the selected part of an image as files of numbers state it."""
     return {"volume": part.volume, "crop": part.crop, "slice": part.slice_}
 
 
 def has_model(options: SolverOptions) -> bool:
-    """Whether a file is to hold more than the mesh and what labels are called."""
+    """Return whether a file contains more than the mesh and the names of labels."""
     own = {each.name: getattr(options, each.name) for each in fields(SolverOptions) if each.name != "label_names"}
     return SolverOptions(**own) != SolverOptions()
 
 
 def near_hint(name: str, names: Iterable[str]) -> str:
-    """Words for the end of a message, if one of the names is near to the one that there is not."""
+    """Return a suggestion for the end of a message if one of the names resembles the unknown one."""
     plain = {each.strip("-").replace("-", "_"): each for each in names}
     former = plain.get(FORMER_NAMES.get(name.strip("-").replace("-", "_"), ""))
     near = [former] if former is not None else get_close_matches(name, plain.values(), 1)
-    return f"; is {near[0]} meant?" if near else ""
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def kinds_of(record: Any) -> dict[str, Any]:
-    """The fields of a kind of record with their annotations."""
+    """Return the fields of a record class with their annotations."""
     return _known_kinds(record)
 
 
@@ -417,22 +414,22 @@ def _known_kinds(record: Any) -> dict[str, Any]:
 
 
 def has_option(kind: Any) -> bool:
-    """Whether an annotation says anything of an option."""
+    """Return whether an annotation describes an option."""
     return any(isinstance(each, Option) for each in get_args(kind)[1:])
 
 
 def option_of(kind: Any) -> Option:
-    """What an annotation says of its option."""
+    """Return the option described by an annotation."""
     return next(each for each in get_args(kind)[1:] if isinstance(each, Option))
 
 
 def option_name(name: str, kind: Any) -> str:
-    """What a record's field is called on the command line, without hyphens before it, e.g. "k-d"."""
+    """Return the name of a record's field on the command line, without leading hyphens, e.g. "k-d"."""
     return option_of(kind).name or name.replace("_", "-").lower()
 
 
 def given_options(record: Any) -> dict[str, Any]:
-    """What a record gives that is not the default, by the names of the command line; of arguments, by the field's.
+    """Return a record's values that differ from the default, by command-line names; arguments by their fields' names.
 
     Records of the same fields and values have equal dictionaries.
     """

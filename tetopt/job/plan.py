@@ -1,4 +1,4 @@
-"""What a run is to do: contradictions are refused, defaults are filled in, once and here."""
+"""Planning of a run: contradictions are refused and defaults filled in, only here."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.files import checked_output, results_folder
 
-FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
+FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
 
 
 class Plan(NamedTuple):
-    """A run without contradictions: options whose default does not depend on the image have their value.
+    """A consistent run, with the defaults that do not depend on the image.
 
     Parameters
     ----------
     mode : {"graded", "uniform", "paper", "start"}
-        As of `mesh_image`.
+        As in `mesh_image`.
     job : JobOptions
         The options, with defaults.
     bare : JobOptions
-        As they came, without.
+        The options as given, without defaults.
     division : Division
         In one piece, or in parts.
     left : VolumeFile, optional
-        The image of a run in parts, if it is left in its file.
+        The image of a run in parts, if it stays in its file.
     pictures : sequence of Path
-        To be drawn: slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail.
+        Pictures to draw: slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail.
 
     Examples
     --------
@@ -74,12 +74,12 @@ class Plan(NamedTuple):
 
     @property
     def order(self) -> int:
-        """Of the cells, 1 or 2: linear ones by default."""
+        """Order of the cells, 1 or 2; by default 1, linear."""
         return self.job.order or 1
 
     @property
     def engine_options(self) -> dict[str, Any]:
-        """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
+        """Options of `mesh_image` except those of the initial mesh, in the order of run.json."""
         job = self.job
         options = {"k_D": job.k_D, "iterations": job.iterations, "boundary": job.boundary}
         if self.mode == "paper":
@@ -87,14 +87,14 @@ class Plan(NamedTuple):
         return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
 
     def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
-        """The same of other images and other files, as many and of the same options.
+        """Return the plan with other images and files, in equal number and for the same options.
 
         Parameters
         ----------
         images : sequence of Path
             Contrasts.
         files : mapping of str to Path
-            The others, by the names of their options.
+            The other files, by the names of their options.
 
         Returns
         -------
@@ -113,7 +113,7 @@ class Plan(NamedTuple):
 
 
 def kind_of(plan: Plan, ndim: int) -> str:
-    """What the initial mesh is: a kind of lattice, octree or start."""
+    """Return the kind of the initial mesh: a kind of lattice, octree or start."""
     if plan.mode == "start":
         return "start"
     if plan.mode == "graded":
@@ -122,7 +122,7 @@ def kind_of(plan: Plan, ndim: int) -> str:
 
 
 def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
-    """The options as the mesh's file and run.json state them; files by their names."""
+    """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
     return {
         "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
@@ -137,26 +137,26 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
 
 
 def plan(job: JobOptions) -> Plan:
-    """The run that a job asks for, with the defaults that do not depend on the image; no voxel is read.
+    """Plan a job: check it, and fill in the defaults that do not depend on the image; no voxel is read.
 
     Parameters
     ----------
     job : Job
-        What is asked for.
+        The job to plan.
 
     Returns
     -------
     Plan
-        With the pictures to draw.
+        The plan, with the pictures to draw.
 
     Raises
     ------
     InputError
-        As `Job`; an output that may not be written.
+        As `Job`; an output may not be written.
 
     See Also
     --------
-    read : Reads the files, too, and fills in what depends on them.
+    read : Also read the files, and fill in the defaults that depend on them.
 
     Examples
     --------
@@ -171,12 +171,12 @@ def plan(job: JobOptions) -> Plan:
 
 
 def resolved(job: JobOptions) -> Plan:
-    """The same without a look at any file.
+    """Plan a job without accessing any file.
 
     Raises
     ------
     InputError
-        Options that contradict each other or are out of range, as far as they tell without any file being read.
+        Options contradict each other or are out of range, as far as no file has to be read.
     """
     _check_source(job)
     _check_numbers(job)
@@ -194,42 +194,42 @@ def resolved(job: JobOptions) -> Plan:
     ):
         if mode != "graded" and getattr(job, name) is not None:
             raise InputError(
-                f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
+                f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
             )
     completed = _completed(job, mode)
     is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
-        raise InputError("`method` paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
+        raise InputError("`method` paper: needs one IMAGE and its whole box; leave out mask, labels and other images")
     return Plan(mode, completed, job)
 
 
 def changed(job: JobOptions, **values: Any) -> JobOptions:
-    """The options with other values, which are those of a plan, and not looked at."""
+    """Return the options with values of a plan, which are not checked."""
     return JobOptions(**(vars(job) | values))
 
 
 def _check_source(job: JobOptions) -> None:
-    """InputError for what of mask and labels contradicts itself."""
+    """Raise InputError for contradictions among the options of mask and labels."""
     if job.mask is not None and job.background is not None:
-        raise InputError("`mask` and `background`: give one of them")
+        raise InputError("`mask` and `background`: give only one of them")
     if job.keep_components and job.mask is None and job.background is None:
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
     if job.labels is not None and job.tissues is not None:
-        raise InputError("`labels` and `tissues`: give one of them")
+        raise InputError("`labels` and `tissues`: give only one of them")
     if job.merge is not None and job.labels is None:
-        raise InputError("`merge`: there are no `labels`")
+        raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
         for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
             if getattr(job, name) is not None:
-                raise InputError(f"`{name}`: there are no `labels`")
+                raise InputError(f"`{name}`: needs `labels`")
         if job.free_volumes:
-            raise InputError("`free_volumes`: there are no `labels`")
+            raise InputError("`free_volumes`: needs `labels`")
     if job.merge is not None and named_file(job.merge) is None:
         groups_of(job.merge)
 
 
 def _check_numbers(job: JobOptions) -> None:
-    """InputError for numbers that are none of their options', whatever the image is."""
+    """Raise InputError for numbers that are invalid for any image."""
     check_weights(len(job.images), *balance_of(job))
     if job.background not in (None, "auto"):
         number_of("`background`", str(job.background))
@@ -249,27 +249,25 @@ def _check_numbers(job: JobOptions) -> None:
 
 
 def _mode(job: JobOptions) -> Mode:
-    """Which of the four ways the options ask for; a graded mesh is the default."""
+    """Return the mode that the options select; a graded mesh is the default."""
     numbers = {"`nodes`": job.nodes, "`spacing`": job.spacing, "`target_error`": job.target_error}
     if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
-        raise InputError(f"{' and '.join(names)}: give one of them")
+        raise InputError(f"{' and '.join(names)}: give only one of them")
     is_paper = job.method == "paper"
     if job.lattice == "octree":
         if job.uniform:
-            raise InputError("`uniform` and `lattice` octree: give one of them")
+            raise InputError("`uniform` and `lattice` octree: give only one of them")
         if is_paper:
             raise InputError("`lattice` octree: only with `method` fast, got `method` paper")
         if job.spacing is not None:
-            raise InputError("`lattice` octree: has no one spacing; give `nodes` instead of `spacing`")
+            raise InputError("`lattice` octree: has no single spacing; use `nodes` instead of `spacing`")
     if job.start is not None:
         others = {**numbers, "`lattice`": job.lattice, "`mask`": job.mask, "`background`": job.background}
         others["`uniform`"] = job.uniform or None
         if names := [name for name, value in others.items() if value is not None]:
-            raise InputError(
-                f"`start` and {names[0]}: {job.start} has its nodes and its boundary already; leave one out"
-            )
+            raise InputError(f"`start` and {names[0]}: {job.start} already has nodes and a boundary; leave one out")
         if is_paper:
-            raise InputError("`start`: only with `method` fast, whose moves keep a boundary that is not convex")
+            raise InputError("`start`: only with `method` fast, which preserves a non-convex boundary")
         return "start"
     if is_paper:
         return "paper"
@@ -278,7 +276,7 @@ def _mode(job: JobOptions) -> Mode:
 
 
 def _completed(job: JobOptions, mode: Mode) -> JobOptions:
-    """The engine's options with the defaults of the mode; InputError where they cannot be."""
+    """Return the engine's options with the mode's defaults; raise InputError for invalid ones."""
     default = MODE_DEFAULTS[mode]
     k_D = default.k_D if job.k_D is None else job.k_D
     iterations = default.iterations if job.iterations is None else job.iterations
@@ -302,14 +300,14 @@ def _completed(job: JobOptions, mode: Mode) -> JobOptions:
 
 
 def _check_method(job: JobOptions, method: Method, names: tuple[str, ...]) -> None:
-    """InputError for an option of the other method."""
+    """Raise InputError for an option of the other method."""
     wrong = [name for name in names if getattr(job, name) is not None]
     if wrong and job.method != method:
         raise InputError(f"`{wrong[0]}`: only with `method` {method}, got `method` {job.method}")
 
 
 def _pictures(job: JobOptions) -> list[Path]:
-    """The pictures to draw, as far as they may be written."""
+    """Return the pictures to draw, after a check that they may be written."""
     if job.figures is None:
         return []
     names = ["slice.png", "rho.png", "energies.png"]
@@ -322,10 +320,10 @@ def _pictures(job: JobOptions) -> list[Path]:
 def with_numbers(
     plan: Plan, content: Content, table: LabelTable = NO_TABLE
 ) -> tuple[Plan, Sizes | None, SizesByLabel | None]:
-    """The plan with the defaults that depend on the image, the sizes, and what labels get of them; `table` names these.
+    """Return the plan with the defaults that depend on the image, the sizes, and those by label; `table` names labels.
 
-    These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
-    anyway and is stated.
+    The defaults are the number of nodes, as the sizes require or fewer on small images, and the longest edge, which
+    applies anyway and is stated.
     """
     image, job = content.image, plan.job
     is_counted = job.nodes is not None or job.target_error is not None or job.spacing is not None
@@ -348,9 +346,9 @@ def with_numbers(
 
 
 def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
-    """As many nodes as the targets take, where there are any, and elsewhere their part of the usual number.
+    """Return the number of nodes that the targets require, and elsewhere the same fraction of the usual number.
 
-    `many` are the nodes in all to a corner of cells.
+    `many` is the number of all nodes per corner node.
     """
     corners = float(
         np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
@@ -362,7 +360,7 @@ def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
 
 
 def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
-    """The limits on sizes, if the options ask for any."""
+    """Return the limits on sizes, if the options set any."""
     by_label = None if job.label_size is None else label_sizes_of(job.label_size, table)
     field = None if job.sizing is None else read_companion(job.sizing)
     values = {

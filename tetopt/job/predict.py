@@ -1,4 +1,4 @@
-"""How long a run takes and how much memory, by its sizes, before it begins."""
+"""Prediction of a run's time and memory from its sizes."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
 
-SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
-QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly meets it
-SAMPLED_VALUES = 10_000  # of an image: one that is no whole number tells that most are none
+SEARCH_RUNS = 4  # for a target error, mostly, each with about the default number of nodes
+QUADRATIC_RUNS = 2  # for a number of nodes of order 2: the second mostly reaches it
+SAMPLED_VALUES = 10_000  # of an image: if one is not a whole number, most are not
 
 
 def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | None = None) -> RunSize:
-    """The sizes of a run whose files have been read.
+    """Return the sizes of a run whose files have been read.
 
     Parameters
     ----------
     plan : Plan
         With the numbers that depend on the image (`tetopt.job.plan.with_numbers`).
     content : Content
-        What is meshed.
+        The content to mesh.
     whole : Image
-        The first contrast as it was read.
+        The first contrast as read.
     n_started : int, optional
-        Nodes, corners of cells, of a mesh to start from.
+        Number of corner nodes of a mesh to start from.
     """
     nodes, spacing = plan.job.nodes, plan.job.spacing
     if nodes is None and spacing is not None:
@@ -55,16 +55,16 @@ def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | Non
 
 
 def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
-    """The same, of files of which only the headers are read.
+    """Return the sizes of a run from the headers of its files.
 
-    What shows only in the voxels is taken from a run with the same options, `like`, whose files have been read: the
-    fraction of the voxels that a mask leaves, the channels of labels, nodes where no number is asked for. Without one
-    it is all voxels, one channel for all labels, and the default number.
+    Quantities that depend on the voxels come from a run `like` with the same options, whose files have been read: the
+    fraction of voxels within a mask, the channels of labels, and the number of nodes if none is requested. Without
+    such a run, these are all voxels, one channel for all labels, and the default number.
 
     Raises
     ------
     InputError
-        As `tetopt.io.images.file_shape`, or `load_image` of a picture or DICOM, which is read.
+        As `tetopt.io.images.file_shape`, or `load_image` for a picture or DICOM, which is read.
     """
     job, path = plan.job, plan.job.images[0]
     shape = cropped_shape(plan, (file_shape(path) or load_image(path, volume=job.volume).shape)[:3])
@@ -83,7 +83,7 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
 
 
 def cropped_shape(plan: Plan, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """What the crop that is asked for leaves of voxels of this shape."""
+    """Return the shape of voxels after the requested crop."""
     if plan.job.crop is None:
         return shape
     bounds = zip(shape, parse_crop(plan.job.crop), strict=False)
@@ -91,7 +91,7 @@ def cropped_shape(plan: Plan, shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _is_whole(content: Content) -> bool:
-    """Whether the image has whole numbers: all of them if that is known, else some of its voxels."""
+    """Return whether the image has whole numbers: in all voxels if known, else in a sample of them."""
     if content.statistics is not None:
         return content.statistics.is_whole
     data = content.image.data.ravel()
@@ -100,13 +100,13 @@ def _is_whole(content: Content) -> bool:
 
 
 def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:
-    """Of voxels with these edges, mm."""
+    """Return the elongation of voxels with these edges, mm."""
     *across, along = (float(edge) for edge in spacing)
     return along / prod(across) ** (1.0 / len(across))
 
 
 def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
-    """What the options and headers tell of a run on voxels of this shape; each file is a channel."""
+    """Return the sizes of a run on voxels of this shape, from options and headers; each file is a channel."""
     job, order, ndim = plan.job, plan.order, len(shape)
     files = [*job.images, *(path for path in (job.mask, job.labels, *tissue_files(job.tissues)) if path is not None)]
     runs = SEARCH_RUNS if plan.job.target_error is not None else 1
@@ -126,5 +126,5 @@ def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
 
 
 def stated_prediction(size: RunSize) -> dict[str, Any]:
-    """The sizes and what they come to, on the machine of the fit, as run.json states them."""
+    """Return the sizes and the prediction, on the machine of the fit, as run.json states them."""
     return {"size": size, **predicted(size, numba.get_num_threads())._asdict()}

@@ -1,4 +1,4 @@
-"""The files that a run names, read and set beside one another."""
+"""Reading and alignment of the files of a run."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from tetopt.mesh import Mesh
 
 
 def read(job: Job) -> Task:
-    """What a job asks for, planned and read, with its threads set: what `tetopt.run` begins with.
+    """Plan a job, set its threads and read its files; the first step of `tetopt.run`.
 
     Parameters
     ----------
     job : Job
-        What is asked for.
+        The job to read.
 
     Returns
     -------
     Task
-        The plan with its defaults, and the files beside one another. Nothing is written.
+        The plan with its defaults, and the aligned files. Nothing is written.
 
     Raises
     ------
     InputError
-        As `plan`; a file that cannot be read, or does not go with the others; options that parts do not have, where
-        the mesh is to be made in some.
+        As `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
+        support.
 
     See Also
     --------
-    plan : The first half of it, which reads no voxels.
-    run : Goes on with it.
+    plan : The first half, which reads no voxels.
+    run : Run the task.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def read(job: Job) -> Task:
 
 
 def read_planned(plan: Plan) -> Task:
-    """The files that a plan names, and the defaults that depend on them."""
+    """Read the files of a plan, and fill in the defaults that depend on them."""
     source = left_source(plan) or read_source(plan.job, plan.job.label_names)
     plan.division.check_image(source.content.image)
     begun = None
@@ -76,19 +76,19 @@ def read_planned(plan: Plan) -> Task:
         tell_label_sizes(by_label, plan.job.cells_across, source.table)
     n_started = None if begun is None else len(begun.mesh.points)
     size = size_of_run(plan, source.content, source.contrasts[0], n_started)
-    # With the checksums of the files as they are now.
+    # With the files' current checksums.
     request = requested(changed(plan.bare, parts=plan.division.n_parts))
     return Task(plan, source, begun, sizes, size, request, by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:
-    """InputError for a mesh off the image, a warning for one that lies partly beside it."""
+    """Raise InputError for a mesh outside the image; warn of one partly outside."""
     if mesh.ndim != image.ndim:
-        raise InputError(f"{path}: expected a {image.ndim}-D mesh, as the image is, got a {mesh.ndim}-D one")
+        raise InputError(f"{path}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one")
     index = image.to_index(centroids(mesh.points, mesh.cells))
     low, high = box_sides(image.shape).T
     is_in = ((index >= low) & (index <= high)).all(axis=1)
     if not is_in.any():
-        raise InputError(f"{path}: lies beside the image; do both lie in the same world mm (RAS+)?")
+        raise InputError(f"{path}: the mesh lies outside the image; are both in the same world coordinates, mm (RAS+)?")
     if not is_in.all():
-        warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie beside the image, where it has no say")
+        warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, which does not affect them")

@@ -1,4 +1,4 @@
-"""What was asked of a run, with checksums: equal for runs that come to the same mesh, and kept in their run.json."""
+"""The request of a run, with checksums: equal for runs with the same mesh, and stored in their run.json."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
-# Options on which no output depends: names of outputs, threads, and who works on parts.
+# Options that do not affect the outputs: names of outputs, threads, and the workers of parts.
 WITHOUT_SAY = (
     "threads",
     *(each.name for each in (*fields(OutputOptions), *fields(PartsOptions)) if each.name != "parts"),
@@ -24,20 +24,20 @@ WITHOUT_SAY = (
 
 
 def requested(job: JobOptions) -> dict[str, Any]:
-    """What decides the outputs of a run: options, the files' names and checksums, the version.
+    """Return all that determines the outputs of a run: options, the files' names and checksums, the version.
 
-    Names of outputs and of folders are no part of it, nor is the number of threads, nor who works on parts.
+    Names of outputs and of folders, the number of threads and the workers of parts are not included.
 
     Returns
     -------
     dict
-        `options`, those that were given, with `format`, the suffix of the mesh's file; `files`, of each option that
-        names any a list of [name, SHA-256]; `tetopt`, the version; and `sha256` of all this.
+        `options`, the given ones, with `format`, the suffix of the mesh's file; `files`, for each option with files
+        a list of [name, SHA-256]; `tetopt`, the version; and `sha256` of all this.
 
     Raises
     ------
     InputError
-        A file is missing, or may not be read.
+        A file is missing or unreadable.
     """
     kinds = kinds_of(JobOptions)
     left_out = {option_name(name, kinds[name]) for name in WITHOUT_SAY}
@@ -53,7 +53,7 @@ def requested(job: JobOptions) -> dict[str, Any]:
 
 
 def _files(name: str, value: Any) -> list[Path]:
-    """The files among an option's values."""
+    """Return the files among an option's values."""
     if name.replace("-", "_") in FILES_IN_TEXTS:
         return [] if (file := named_file(value)) is None else [file]
     if name == "tissues":
@@ -62,11 +62,11 @@ def _files(name: str, value: Any) -> list[Path]:
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a file, or folder, that an option names, as hexadecimal digits; taken once of what has not changed."""
+    """SHA-256 of an option's file or folder, as hexadecimal digits; computed again only after a change."""
     file, _ = file_and_volume(path)
     return _kept_checksum(file, stored_checksum(file))
 
 
-@cache  # an atlas's mask may go with each of a thousand subjects
+@cache  # a thousand subjects may share an atlas's mask
 def _kept_checksum(path: Path, _state: str) -> str:
     return sha256(path)

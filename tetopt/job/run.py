@@ -25,27 +25,27 @@ from tetopt.system.files import outputs_of_run, save_json
 
 
 class Result(NamedTuple):
-    """What came of a run.
+    """The result of a run.
 
     Parameters
     ----------
     mesh : Mesh
-        The optimised mesh, as its file has it.
+        The optimised mesh, as in its file.
     model : Model
         The mesh with its fields, sets, materials and loads.
     numbers : dict
-        Every number of the run, as run.json has them.
+        Every number of the run, as in run.json.
     violated : dict of str to str
-        By name, the requirements that the mesh does not meet, and what could not be measured, a sentence each; empty if
-        it is all that it should be.
+        By name, a sentence on each violated requirement and on each failed measurement; empty if the mesh meets all
+        requirements.
     task : Task
-        What was asked for, with all defaults, and the files as they were read.
+        The task, with all defaults, and the files as read.
     meshed : Meshed
         The optimisation: its history, the initial mesh, seconds.
     shapes : tuple of Quality
-        Of the initial mesh and of the result; None for one that could not be measured.
+        Quality of the initial mesh and of the result; None if a measurement failed.
     measured : dict
-        How well mask, labels, contrasts and sizes are met.
+        Fit to mask, labels, contrasts and sizes.
 
     Examples
     --------
@@ -71,35 +71,35 @@ class Result(NamedTuple):
 
 
 def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = None) -> Result:
-    """Mesh images as a job asks for, and write its outputs: what `tetopt mesh` does, to the same bytes.
+    """Mesh images as a job specifies, and write its outputs, as `tetopt mesh` does, with the same bytes.
 
     Parameters
     ----------
     job : Job
-        What is asked for.
+        The job to run.
     on : callable, optional
-        Gets each `Event`; without one warnings and violated requirements are Python's warnings.
+        Called with each `Event`; without it, warnings and violated requirements are Python's warnings.
     stop : callable, optional
-        Asked between colours of nodes; True ends the run there, with the mesh so far.
+        Called between colours of nodes; True ends the run with the mesh so far.
 
     Returns
     -------
     Result
-        With mesh, model and numbers.
+        Mesh, model and numbers.
 
     Raises
     ------
     InputError
-        As `Job`; files that cannot be read or do not belong together; an output that may not be written, or could not
-        be: the message says where the mesh is then.
+        As `Job`; files cannot be read or do not belong together; an output may not or cannot be written: the message
+        then says where the mesh is.
 
     See Also
     --------
-    mesh_image : The same of an image in memory, without files.
+    mesh_image : Mesh an image in memory, without files.
 
     Notes
     -----
-    In parts, workers are processes that begin by importing your program: let it call this under
+    In parts, workers are processes that first import your program: call this function under
     ``if __name__ == "__main__":``.
 
     Examples
@@ -115,7 +115,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
         came = meshed(task, stop or (lambda: False), begin)
         failed: dict[str, str] = {}
         model, about = saved(task, came, failed)
-        # Only from here on, as nothing may fail before the mesh is written.
+        # Only now, as nothing may fail before the mesh is written.
         shapes = _shapes(came, failed)
         measured = measured_of(task, came.result, model, failed)
         numbers = numbers_of(task, came, shapes, model, about, time.perf_counter() - begin)
@@ -139,15 +139,15 @@ def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
 
 
 def _judged(result: Result, failed: dict[str, str]) -> dict[str, str]:
-    """What the mesh should be and is not; all of it, and what is odd, is told."""
+    """Report and return violated requirements and failed measurements; warn of oddities."""
     task, came, measured = result.task, result.meshed, result.measured
     problems = tell_violated(came.result, measured, task.source.mask_word)
     for name, reason in failed.items():
-        left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
+        left = "the mesh's file has no cell means" if name == "fields" else "all other numbers are written"
         problems[name] = f"{name} could not be measured: {reason}; {left}"
         violated(problems[name])
     if task.source.is_constant:
-        measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
+        measured = {**measured, "cells_without_voxel": 0}  # whose values are right anyway
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)

@@ -1,4 +1,4 @@
-"""A mesh's file solved with its loads, or an image's box compressed as in the paper."""
+"""Solution of a mesh's file with its loads, or of an image's box compressed as in the paper."""
 
 from __future__ import annotations
 
@@ -33,45 +33,45 @@ if TYPE_CHECKING:
     from tetopt.fem.conditioning import Conditioning
     from tetopt.fem.solution import Solution
 
-INTENSITY_MAPPING = "h"  # an image without a modulus: its intensities are the moduli, as in the paper
-PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
-SMALL_FRACTION = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
+INTENSITY_MAPPING = "h"  # without a modulus, the image's intensities are the moduli, as in the paper
+PAPER_PERCENT = 1.0  # compression of the paper's test, only a scale for a linear law
+SMALL_FRACTION = 0.1  # of the mesh's length: larger displacements are not small, with strains of about 10 %
 
 
 class SolvedModel(NamedTuple):
-    """What came of solving a mesh."""
+    """The solution of a mesh."""
 
     model: Model
-    options: ModelOptions  # with what they were by default
+    options: ModelOptions  # with their defaults
     solutions: list[Solution]  # of each step
     extremes: Conditioning | None
-    numbers: dict[str, Any]  # all of them, as `tetopt fem --json` writes them
+    numbers: dict[str, Any]  # all numbers, as `tetopt fem --json` writes them
 
 
 def solve_file(
     mesh: Path, image: Path | None = None, output: Path | None = None, *, model: ModelOptions, part: LabelledPart,
     compress: float | None = None, conditioning: bool | None = None,
 ) -> SolvedModel:  # fmt: skip
-    """Solve a mesh with its loads, and write what was found on it.
+    """Solve a mesh with its loads, and write the results.
 
     Parameters
     ----------
     mesh : Path
     image : Path, optional
-        Mappings are of its intensities. Without loads its box is compressed, and without a mapping they are the moduli.
+        Source of mappings. Without loads its box is compressed; without a mapping its intensities are the moduli.
     output : Path, optional
-        A file of VTK's for the mesh with displacements, strains and stresses.
+        A VTK file for the mesh with displacements, strains and stresses.
     model : ModelOptions
     part : LabelledPart
     compress : float, optional
-        By how many percent the box is compressed, instead of other loads.
+        Compression of the box in percent, instead of other loads.
     conditioning : bool, optional
-        Whether the first step's condition number is found; by default only of a compressed box.
+        Whether to compute the first step's condition number; by default only for a compressed box.
 
     Raises
     ------
     InputError
-        Files that cannot be read or do not belong together; a mesh without moduli or loads; one that is not held.
+        Files cannot be read or do not belong together; the mesh has no moduli or loads, or is not fixed.
     """
     if image is not None:
         model = replace(model, young=model.young or INTENSITY_MAPPING, average=model.average or DEFAULT_AVERAGE)
@@ -99,23 +99,21 @@ def solve_file(
 
 
 def _check_options(image: Path | None, compress: float | None, model: ModelOptions, part: ImagePart) -> None:
-    """InputError for what is wrong whatever the files hold."""
+    """Raise InputError for options that are invalid for any file."""
     if compress is not None and not 0.0 < compress <= MOST_COMPRESSION_PERCENT:
         most = f"{MOST_COMPRESSION_PERCENT:g}"
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
-        raise InputError(
-            "`compress` and `loads`: give one of them, as in `loads` compress:5% `loads` pressure:left:1.5"
-        )
+        raise InputError("`compress` and `loads`: give only one, as in `loads` compress:5% `loads` pressure:left:1.5")
     if image is None and (lost := [name for name, value in stated_part(part).items() if value is not None]):
-        raise InputError(f"`{lost[0]}`: there is no IMAGE, only a mesh")
+        raise InputError(f"`{lost[0]}`: needs an IMAGE, got only a mesh")
     if image is None and model.average is not None:
-        raise InputError("`average`: it is over an image's voxels; give the IMAGE before the MESH")
+        raise InputError("`average`: averages over an image's voxels; pass the IMAGE before the MESH")
     check_model_options(model, has_materials=True)
 
 
 def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None) -> ModelOptions:
-    """The options with what is left out taken from the mesh's file, or, of an image's box, from the paper's test."""
+    """Return the options, completed from the mesh's file, or for an image's box from the paper's test."""
     if model.order is None:
         model = replace(model, order=loaded.order)
     if compress is not None or (image is not None and not model.loads):
@@ -124,18 +122,18 @@ def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress
         model = replace(model, loads=loads_of(loaded))
     if model.young is None and "young" not in loaded.cell_data:
         raise InputError(
-            "the mesh's file has no moduli: give `young`, such as `young` 3.5, or the IMAGE before the MESH"
+            "the mesh's file has no moduli: pass `young`, such as `young` 3.5, or the IMAGE before the MESH"
         )
     if not model.loads:
         raise InputError(
-            "the mesh's file has no loads: give `loads`, such as `loads` compress:5%, "
+            "the mesh's file has no loads: pass `loads`, such as `loads` compress:5%, "
             "or `loads` hold:inferior `loads` pressure:superior:1.5"
         )
     return model
 
 
 def _check_box(image: Image, loaded: MeshFile) -> None:
-    """InputError unless the mesh fills the image's box: what is compressed is the box."""
+    """Raise InputError unless the mesh fills the image's box, which is compressed."""
     from tetopt.fem.elasticity import box_faces, check_fills_box
 
     box_faces(image, loaded.mesh)
@@ -143,14 +141,14 @@ def _check_box(image: Image, loaded: MeshFile) -> None:
 
 
 def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Model:
-    """The mesh with all that it is solved with."""
+    """Build the model to solve."""
     box = loaded.box if image is None else box_of(image)
     about = {} if box is None else {"box": box_text(box)}
     return model_of_file(loaded, image, options, about, box, has_units=options.young != INTENSITY_MAPPING)
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
-    """Each step solved, and the conditioning of the first, if it is to be known."""
+    """Solve each step, and compute the conditioning of the first if requested."""
     from tetopt.fem.conditioning import conditioning
     from tetopt.fem.solution import solve
 
@@ -158,11 +156,11 @@ def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditi
         solutions = [solve(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
         return solutions, conditioning(solutions[0].system) if is_conditioned else None
     except RuntimeError as error:
-        raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
+        raise InputError(f"{error}; for this mesh the moduli differ too much, or nu is too close to 0.5") from error
 
 
 def _with_results(model: Model, solutions: list[Solution]) -> Model:
-    """The model with what was found on its cells and nodes, and the reactions among its texts."""
+    """Return the model with the solutions' fields, and the reactions among its texts."""
     from tetopt.fem.solution import solution_fields
 
     cell_data, point_data, about = dict(model.cell_data), dict(model.point_data), dict(model.about)
@@ -179,21 +177,21 @@ def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
 
 
 def _advise(model: Model, solutions: list[Solution]) -> None:
-    """Lines where the cells are of the wrong order for the material, or the displacements too large for the method."""
+    """Warn if the order is unsuitable for the material, or the displacements are too large for the method."""
     if words := locking_words(model):
         warning(words)
     size = float(np.ptp(model.mesh.points, axis=0).max())
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
     if moved > SMALL_FRACTION * size:
         note(
-            f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length: small "
-            "displacements, which this solves, no longer hold; look at the loads and at what is held, or write a file "
-            "for CalculiX with `nonlinear`"
+            f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length, too "
+            "large for this linear solution; check loads and fixed sets, or write a file for CalculiX with "
+            "`nonlinear`"
         )
 
 
 def _numbers_of(solution: Solution) -> dict[str, Any]:
-    """The numbers of a step for the JSON file."""
+    """Return the numbers of a step for the JSON file."""
     from tetopt.fem.elasticity import cell_means
     from tetopt.fem.solution import von_mises
 
@@ -210,7 +208,7 @@ def _numbers_of(solution: Solution) -> dict[str, Any]:
 
 
 def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | None) -> dict[str, Any]:
-    """All numbers for the JSON file; the strain energy is the first step's."""
+    """Return all numbers for the JSON file; the strain energy is the first step's."""
     numbers: dict[str, Any] = {
         "n_nodes": len(model.mesh.points),
         "n_nodes_in_all": len(solutions[0].u),

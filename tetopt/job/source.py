@@ -1,4 +1,4 @@
-"""What is meshed: contrasts, labels and mask, on the voxels of the first image."""
+"""The inputs of a mesh: contrasts, labels and mask, on the voxels of the first image."""
 
 from __future__ import annotations
 
@@ -39,31 +39,31 @@ from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renum
 
 
 class Source(NamedTuple):
-    """What is meshed, and the files that it comes from."""
+    """The content to mesh, and its files."""
 
     paths: list[Path]  # of the contrasts
-    weights: list[float]  # likewise
+    weights: list[float]  # of the contrasts
     content: Content
     contrasts: list[Image]  # on the first one's voxels
-    labels: Image | None  # likewise
+    labels: Image | None  # on the same voxels
     mask: Image | None
     about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
-    drawn: Image  # the first contrast as pictures show it: of one that is left in its file a coarser level
+    drawn: Image  # the first contrast for pictures; a coarser level of one that stays in its file
 
     @property
     def image(self) -> Image:
-        """The first contrast on its own voxels; beyond a mask, around which alone they are kept, continued."""
+        """The first contrast on its own voxels, continued beyond the mask, around which alone voxels are kept."""
         return continued(self.contrasts[0], self.content.continuation)
 
     @property
     def own(self) -> Content:
-        """That contrast by itself, on its own voxels; `content` may be on divided ones, and has more channels."""
+        """The first contrast alone, on its own voxels; `content` may have divided voxels, and has more channels."""
         return Content(self.image, statistics=self.content.statistics)
 
     @property
     def mask_word(self) -> str:
-        """The word of messages for the part of the image that is meshed."""
+        """The name of the meshed region in messages."""
         return "mask" if self.about["inputs"]["background"] is None else "foreground"
 
     @property
@@ -73,14 +73,14 @@ class Source(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """Whether what is meshed has one value everywhere."""
+        """True if the content has one value everywhere."""
         spread = self.content.spread
         return spread.low == spread.high
 
     def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
-        """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label.
+        """Return the fields of the mesh's file: those of `cell_fields`, means of further contrasts, and the label.
 
-        `labels` (M,) are those of the optimisation; without, a cell has the label of most of its voxels.
+        `labels` (M,) are those of the optimisation; without them, a cell has the majority label of its voxels.
         """
         fields = cell_fields(mesh, self.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
@@ -93,12 +93,12 @@ class Source(NamedTuple):
         return fields
 
     def with_table(self, table: LabelTable) -> Source:
-        """The same with other names and colours of labels."""
+        """Return the source with other names and colours of labels."""
         words = {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
         return self._replace(table=table, about=self.about | words)
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
-        """How well cells with these fields represent each contrast: the fraction of its variance left within them."""
+        """Return, for each contrast, the fraction of its variance that is left within cells with these fields."""
         rows = []
         for number, (path, weight) in enumerate(zip(self.paths, self.weights, strict=True), 1):
             mean, variance = (fields[field if number == 1 else f"{field}_{number}"] for field in ("mean", "variance"))
@@ -113,9 +113,9 @@ class Source(NamedTuple):
 def read_source(
     options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None
 ) -> Source:  # fmt: skip
-    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image.
+    """Read images, labels with their names, and mask, on the voxels of the first image.
 
-    Labels get other `numbers`, if they are given, and are merged otherwise as the options and their names say.
+    Labels get other `numbers` if given; otherwise they are merged by the options and their names.
     """
     paths = options.images
     image, beside = image_and_others(paths[0], options)
@@ -130,11 +130,11 @@ def read_source(
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = foreground_mask(image, level)
         note(
-            f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
+            f"background: up to {level:g} and connected to the box's sides; {mask.data.mean():.1%} of the voxels remain"
         )
     balance = balance_of(options)
     if options.weights is None and is_own:
-        note(f"the image is {'its own labels' if tissues is None else 'one of the tissues'}: only these count")
+        note(f"the image is {'its own labels' if tissues is None else 'one of the tissues'}: only these are used")
         balance = balance._replace(weights=[0.0])
     represented = content(
         contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
@@ -164,20 +164,20 @@ def read_source(
 
 
 class ReadLabels(NamedTuple):
-    """Labels of the image's voxels, as they were read."""
+    """Labels of the image's voxels, as read."""
 
     labels: Image | None = None
     table: LabelTable = NO_TABLE
     numbers: Mapping[int, int] = {}
-    tissues: list[Image] | None = None  # probabilities, which the labels are the largest of
-    is_own: bool = False  # whether the image is nothing else
+    tissues: list[Image] | None = None  # probabilities; each label is that of the largest
+    is_own: bool = False  # whether the image contains nothing else
 
 
 def _labelling(
     options: SourceOptions, image: Image, beside: Callable[..., Image], label_names: Path | None,
     numbers: Mapping[int, int] | None,
 ) -> ReadLabels:  # fmt: skip
-    """Labels, merged as is asked for, or tissues, beside the image."""
+    """Read the labels, merged by the options, or the tissues."""
     table, is_alone = label_table(label_names), len(options.images) == 1
     if options.tissues is not None:
         volumes = tissue_volumes(options.tissues)
@@ -196,7 +196,7 @@ def _labelling(
 def _merged(
     labels: Image, table: LabelTable, options: SourceOptions, numbers: Mapping[int, int] | None
 ) -> tuple[Image, LabelTable, Mapping[int, int]]:  # fmt: skip
-    """The labels merged as the options, or names that they share, say; their table; and which have which new number."""
+    """Merge labels by the options, or by shared names; return them, their table, and their new numbers."""
     if numbers is not None:
         return renumbered(labels, numbers), table, numbers
     if options.merge is not None:
@@ -206,22 +206,22 @@ def _merged(
             raise InputError(f"{options.labels}: {error}") from error
         missing = [name for label, name in merged.names.items() if label not in merged.numbers.values()]
         if missing and not is_preset(options.merge):
-            warning(f"`merge`: {options.labels} has no label of {listed(missing)}")
+            warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
-        note(f"labels merged: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
+        note(f"merged labels: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
         return merged.labels, LabelTable(merged.names, {}), merged.numbers
     present = np.unique(labels.data)
     numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}
     if not numbers:
         return labels, table, numbers
     words = [f"{old} into {label_words(new, table.names)}" for old, new in sorted(numbers.items())]
-    note(f"labels merged, as they share a name: {listed(words)}")
+    note(f"merged labels with the same name: {listed(words)}")
     left = set(table.names) - set(numbers_by_name(table.names))
     return renumbered(labels, numbers), table_of_labels(table, left), numbers
 
 
 def whose_variance(content: Content) -> str:
-    """Of what E_D is a fraction, in words; labels that are an image of their own are its only channels."""
+    """Name the variance that E_D is a fraction of; labels that are their own image are the only channels."""
     if content.n_contrasts == 1 and content.n_channels == 1:
         return "the image's variance"
     return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"

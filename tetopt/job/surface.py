@@ -1,4 +1,4 @@
-"""A surface of a mesh's file: of a structure, or between its labels; written, read back and measured."""
+"""Surface of a structure in a mesh's file, or between labels; written, read back and measured."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from tetopt.model.labels import label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
 
-MOST_LISTED = 12  # interfaces in the table; all are among the numbers
+MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurfacePart:
-    """Which surface of a mesh is written, and how its points are."""
+    """Surface of a mesh to write, and its coordinates."""
 
-    below: Annotated[float | None, Option("T", "Of the largest connected set of cells with a mean below T.")] = None
-    label: Annotated[str | None, Option("L", "Of all cells with this label, by number or name.")] = None
-    cell_set: Annotated[str | None, Option("NAME", "Of a named set of cells.", "set")] = None
-    boundary: Annotated[bool, Option(None, "Of the whole mesh; with `interfaces`, the boundary as well as these.")] = (
-        False
+    below: Annotated[float | None, Option("T", "Surface of the largest connected set of cells with means below T.")] = (
+        None
     )
-    interface: Annotated[str | None, Option("J,K", "What lies between two labels, out of J; it may be open.")] = None
+    label: Annotated[str | None, Option("L", "Surface of all cells with this label, by number or name.")] = None
+    cell_set: Annotated[str | None, Option("NAME", "Surface of a named set of cells.", "set")] = None
+    boundary: Annotated[bool, Option(None, "Surface of the whole mesh; with `interfaces`, add it to these.")] = False
+    interface: Annotated[str | None, Option("J,K", "Interface of two labels, normals out of J; may be open.")] = None
     interfaces: Annotated[
-        bool, Option(None, "All interfaces of labels as one surface, each triangle with the labels on its two sides.")
+        bool, Option(None, "All interfaces of labels as one surface, each triangle with the labels on both sides.")
     ] = False
     space: SpaceOption = "ras"
     label_names: LabelNamesOption = None
 
 
 class WrittenSurface(NamedTuple):
-    """What is said of a surface that was written."""
+    """Description of a surface that was written."""
 
     numbers: dict[str, Any]  # as `tetopt surface --json` writes them
     heads: tuple[str, ...]  # of a table
@@ -63,12 +63,12 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
     Raises
     ------
     InputError
-        Not one surface that is asked for; none there; a file that cannot hold it.
+        The request is not for one surface; the surface does not exist; the file cannot hold it.
     """
     _check_part(part, output)
     loaded = read_mesh(mesh)
     if loaded.mesh.ndim != 3:
-        raise InputError(f"{mesh}: expected tetrahedra, whose boundary is a surface, found triangles")
+        raise InputError(f"{mesh}: expected tetrahedra, whose boundary is a surface, got triangles")
     names = label_table(part.label_names, loaded).names
     write = _write_interfaces if part.interfaces or part.interface is not None else _write_closed
     came = write(loaded, mesh, output, part, names)
@@ -76,17 +76,15 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
 
 
 def _check_part(part: SurfacePart, output: Path) -> None:
-    """InputError unless one surface is asked for, and one that the file can hold."""
+    """Raise InputError unless one surface is requested, and the file can hold it."""
     chosen = [part.below is not None, part.label is not None, part.cell_set is not None, part.interface is not None]
     if sum([*chosen, part.boundary or part.interfaces]) != 1:
         raise InputError(
-            "surface: give one of `below`, `label`, `cell_set`, `boundary`, `interface` and `interfaces` (which takes "
-            "the boundary, too, with `boundary`)"
+            "surface: give exactly one of `below`, `label`, `cell_set`, `boundary`, `interface` and `interfaces` "
+            "(`boundary` may be added to `interfaces`)"
         )
     if part.interfaces and output.suffix.lower() not in LABELLED_SUFFIXES:
-        raise InputError(
-            f"{output}: STL cannot tell which labels a triangle lies between; take {' or '.join(LABELLED_SUFFIXES)}"
-        )
+        raise InputError(f"{output}: STL cannot store the labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
     if part.space not in SPACES:
         raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {part.space}")
 
@@ -94,7 +92,7 @@ def _check_part(part: SurfacePart, output: Path) -> None:
 def _write_closed(
     loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
 ) -> WrittenSurface:
-    """The boundary of a structure, or of the whole mesh, written and read back."""
+    """Write the boundary of a structure, or of the whole mesh, and read it back."""
     if part.label is not None:
         chosen = _with_label(loaded, path, labels_named(part.label, names), names)
     else:
@@ -107,17 +105,17 @@ def _write_closed(
         ("triangles", str(len(surface.triangles))),
         ("closed surfaces", str(written.n_pieces)),
         ("volume, mm3", f"{written.volume:.6g}"),
-        ("of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}"),
+        ("volume of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}"),
         ("area, mm2", f"{written.area:.6g}"),
     ]
     if surface.n_parted:
         note(
-            f"{surface.n_parted} nodes and edges where the structure touches itself were parted, by "
-            f"{surface.largest_shift:.2g} mm at most, so that each edge is in two triangles"
+            f"{surface.n_parted} nodes and edges where the structure touches itself were separated, by "
+            f"{surface.largest_shift:.2g} mm at most, so that each edge has two triangles"
         )
     is_sound = written.is_watertight and written.is_winding_consistent and written.volume > 0.0
     if not is_sound:
-        violated(f"{output}: not watertight, by trimesh; please report this")
+        violated(f"{output}: not watertight according to trimesh; please report this")
     measured = {"volume_mm3": written.volume, "area_mm2": written.area, "n_pieces": written.n_pieces}
     parted = {"n_parted": surface.n_parted, "largest_shift_mm": surface.largest_shift}
     lines = ["checked with trimesh: watertight, normals out"] if is_sound else []
@@ -128,7 +126,7 @@ def _write_closed(
 def _write_interfaces(
     loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
 ) -> WrittenSurface:
-    """The facets between labels as they are in the mesh, out of the smaller one, written and read back."""
+    """Write the mesh's facets between labels, with normals out of the smaller label, and read them back."""
     labels = cell_field(loaded, path, "label").astype(np.int64)
     every = label_surfaces(facets(loaded.mesh.cells), labels)
     sides = every.label, every.beyond
@@ -142,7 +140,7 @@ def _write_interfaces(
         is_outer = (sides[1] == OUTSIDE_LABEL) & part.boundary
         rows = np.flatnonzero((sides[0] != OUTSIDE_LABEL) & ((sides[0] < sides[1]) | is_outer))
         if len(rows) == 0:
-            raise InputError(f"{path}: all cells have one label, which has no interfaces; `boundary` is all around")
+            raise InputError(f"{path}: all cells have one label, so there are no interfaces; use `boundary`")
     shown = LabelSurfaces(*(each[rows] for each in every))
     of_triangle = {"label_inside": shown.label, "label_outside": shown.beyond}
     used, triangles = np.unique(shown.nodes, return_inverse=True)
@@ -155,9 +153,9 @@ def _write_interfaces(
 def _of_interfaces(
     output: Path, surface: Surface, shown: LabelSurfaces, names: dict[int, str], written: SurfaceCheck
 ) -> WrittenSurface:
-    """Area and triangles of each pair of labels, and the numbers for the file of numbers."""
+    """Return area and triangles of each pair of labels, and the numbers for the file of numbers."""
     areas = surface_areas(FacetSurface(surface.points, surface.triangles))
-    # Of all triangles together, whatever their labels: at a rim one of them ends, at a seam three or more meet.
+    # For all triangles together, whatever their labels: an edge of a rim has one, an edge of a seam three or more.
     together = LabelSurfaces(np.zeros_like(shown.label), shown.beyond, shown.nodes)
     n_facets = surface_ridges(together).n_facets
     pairs, which, counts = np.unique(
@@ -183,7 +181,7 @@ def _of_interfaces(
 
 
 def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
-    """The labels on both sides of the interface that "J,K" means."""
+    """Parse "J,K" into the labels on both sides of the interface."""
     sides = text.split(",")
     if len(sides) != 2:
         raise InputError(f'`interface`: expected two labels as J,K, by number or name, got "{text}"')
@@ -194,36 +192,36 @@ def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
 
 
 def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> NDArray[np.int64]:
-    """Numbers of the cells of these labels."""
+    """Return the numbers of the cells with these labels."""
     labels = cell_field(loaded, path, "label")
     cells = np.flatnonzero(np.isin(labels, chosen))
     if len(cells) == 0:
         known = ", ".join(label_words(each, names) for each in np.unique(labels)[:20].astype(np.int64).tolist())
         words = " or ".join(label_words(each, names) for each in chosen)
-        raise InputError(f"{path}: no cell has label {words}; there are {known}")
+        raise InputError(f"{path}: no cell has label {words}; the mesh has {known}")
     return cells
 
 
 def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64]:
-    """Numbers of the cells that make up the structure."""
+    """Return the numbers of the structure's cells."""
     if part.cell_set is not None:
         if part.cell_set not in loaded.sets.cells:
             known = ", ".join(loaded.sets.cells) or "none"
-            raise InputError(f'{path}: has no set of cells "{part.cell_set}"; it has {known}')
+            raise InputError(f'{path}: has no cell set "{part.cell_set}"; it has {known}')
         return loaded.sets.cells[part.cell_set]
     if part.below is None:
         return np.arange(len(loaded.mesh.cells))
     mean = cell_field(loaded, path, "mean")
     chosen = largest_component(loaded.mesh.cells, mean < part.below)
     if len(chosen) == 0:
-        raise InputError(f"{path}: no cell has a mean below {part.below:g}, they go from {mean.min():g} up")
+        raise InputError(f"{path}: no cell has a mean below {part.below:g}; the smallest is {mean.min():g}")
     of_faces = face_sets(loaded.mesh, boundary_rows(loaded.mesh), loaded.box)
     touched = [name for name in chain(*FACE_NAMES[3]) if np.isin(of_faces[name][:, 0], chosen).any()]
     if touched and len(chosen) < len(mean):
         note(
-            f"the largest connected set below {part.below:g} touches the box's faces {', '.join(touched)}: it is the "
-            "air around the body, perhaps; `label` or `cell_set` take a structure by its name"
+            f"the largest connected component below {part.below:g} touches the box's faces {', '.join(touched)} and "
+            "may be the air around the body; use `label` or `cell_set` to select a structure"
         )
     if len(chosen) == len(mean):
-        warning(f"every cell has a mean below {part.below:g}: this is the mesh's own boundary")
+        warning(f"every cell has a mean below {part.below:g}: the surface is the mesh's boundary")
     return chosen

@@ -1,4 +1,4 @@
-"""What the stages of a run hand on: the task as read, and what came of it."""
+"""Records that stages of a run pass on: the task as read, and its result."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import Sizes
 
 Shapes = tuple[Quality | None, Quality | None]
-"""Of the initial mesh and of the result, if they could be measured."""
+"""Quality of the initial mesh and of the result, if measured."""
 
 
 class Task(NamedTuple):
-    """What a run works on, as `read` returns it: the plan, and the files that it names.
+    """The work of a run, as `read` returns it: the plan, and its files.
 
     Parameters
     ----------
     plan : Plan
-        With all defaults, also those that depend on the image.
+        The plan with all defaults, including those that depend on the image.
     source : Source
-        What is meshed: `content` of the contrasts, labels and mask, and the files that it comes from.
+        The inputs: `content` of the contrasts, labels and mask, and their files.
     started : MeshFile or None
         The mesh to start from.
     sizes : Sizes or None
         Targets and limits for the cells' edges.
     size : RunSize
-        Numbers of voxels, nodes and iterations, by which time and memory are predicted.
+        Numbers of voxels, nodes and iterations, from which time and memory are predicted.
     request : dict
-        What decides the outputs: options, checksums of files, the version.
+        All that determines the outputs: options, checksums of files, the version.
     by_label : SizesByLabel, optional
-        What sizes labels get, if sizes by label are asked for.
+        Sizes of labels, if sizes by label are requested.
 
     Examples
     --------
@@ -58,27 +58,27 @@ class Task(NamedTuple):
 
     @property
     def start_name(self) -> str:
-        """What the initial mesh is called."""
+        """Name of the initial mesh."""
         return {"graded": "octree", "start": "start"}.get(self.plan.mode, "lattice")
 
 
 class Meshed(NamedTuple):
-    """What came of the optimisation of a run.
+    """The result of a run's optimisation.
 
     Parameters
     ----------
     result : MeshingResult
         The mesh and its history.
     initial : Mesh
-        The mesh that it began with.
+        The initial mesh.
     seconds : dict of str to float
-        `load`, up to the optimisation, and `optimize`.
+        `load`, until the optimisation, and `optimize`.
     predicted : dict
-        What was expected before it began, as run.json states it: `prediction`, and in `memory` the bytes at most.
+        The prediction before the run, as in run.json: `prediction`, and in `memory` the maximum in bytes.
     fields : dict of str to array, optional
-        Of the cells, if they came with the mesh.
+        Fields of the cells, if they came with the mesh.
     is_kept : bool
-        Whether the mesh is in a folder of work until the run is complete.
+        True if a work directory keeps the mesh until the run is complete.
 
     Examples
     --------

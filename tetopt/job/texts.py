@@ -13,7 +13,7 @@ from tetopt.system.public import LARGEST_INTEGER
 
 
 def option_words(options: dict[str, Any]) -> list[str]:
-    """Options as `given_options` returns them, without arguments, as the words of a command."""
+    """Convert options of `given_options`, without arguments, to the words of a command."""
     words = []
     for name, value in options.items():
         if value is True:
@@ -24,38 +24,38 @@ def option_words(options: dict[str, Any]) -> list[str]:
 
 
 def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
-    """The options with other values of options, as texts by their names on the command line.
+    """Return the options with some values replaced by texts, by names of the command line.
 
     A switch is on by "1", "true" or "yes" and off by "0", "false" or "no"; several values of an option that may be
-    repeated stand between semicolons.
+    repeated are separated by semicolons.
 
     Raises
     ------
     InputError
-        An option that there is not, or a value that is none of it.
+        An unknown option, or an invalid value.
     """
     kinds = {option_name(name, kind): (name, kind) for name, kind in kinds_of(RunOptions).items()}
     values: dict[str, Any] = {}
     wrong = []
     for name, text in texts.items():
         if name not in kinds:
-            raise InputError(f"{name}: is no option of tetopt mesh" + near_hint(name, kinds))
+            raise InputError(f"{name}: not an option of tetopt mesh" + near_hint(name, kinds))
         field, kind = kinds[name]
         try:
             values[field] = _value_of(name, get_args(kind)[0], option_of(kind), text)
-        except InputError:  # of a switch
+        except InputError:  # from a switch
             raise
         except ValueError:
             point = text.replace(",", ".")
             is_comma = point != text and re.fullmatch(r"-?[0-9]*\.[0-9]+", point)
-            wrong.append(f'{name}: "{text}" is no value of it' + (f"; write {point}" if is_comma else ""))
+            wrong.append(f'{name}: invalid value "{text}"' + (f"; write {point}" if is_comma else ""))
     if wrong:
         raise InputError("; ".join(wrong))
     return replace(options, **values)
 
 
 def _value_of(name: str, kind: Any, option: Option, text: str) -> Any:
-    """The value of an option that a text is; ValueError if it is none."""
+    """Convert a text to an option's value; raise ValueError if it is invalid."""
     own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     if own is bool:
         if text.lower() not in ("1", "true", "yes", "0", "false", "no"):

@@ -1,4 +1,4 @@
-"""What a run leaves: the mesh in its file, every number, pictures."""
+"""Outputs of a run: the mesh's file, every number, pictures."""
 
 from __future__ import annotations
 
@@ -44,31 +44,31 @@ def model_with(
     task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True,
     labels: NDArray[np.int64] | None = None, fields: dict[str, NDArray] | None = None,
 ) -> Model:  # fmt: skip
-    """The mesh with all that the options say of it; `fields` of its cells are found, if they are not known."""
+    """Build the model of a mesh with the options; `fields` of its cells are computed if not given."""
     source, started = task.source, task.started
     if fields is None:
         fields = source.fields(mesh, labels)
     own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
-        if source.labels is not None:  # of which these are made anew
+        if source.labels is not None:  # whose sets are rebuilt
             names = label_table(None, started).names
             of_labels = label_set_names(names, names).values()
             lost = [name for name in lost if not name.startswith(("label_", "interface_")) and name not in of_labels]
         if lost:
-            note(f"not kept, as their cells or facets are others now: the sets {', '.join(lost)}")
+            note(f"dropped sets whose cells or faces changed during remeshing: {', '.join(lost)}")
         has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
         if "young" in started.cell_data or started.text("loads") is not None or has_results:
-            note("moduli, loads and results of the mesh that is improved are not kept; give `young` and `loads`")
+            note("moduli, loads and results of the input mesh are not kept; pass `young` and `loads`")
     known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
     return solver_model(mesh, source.image.in_memory, solver, fields, about, known_sets)
 
 
 def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
-    """Write the mesh, or keep it elsewhere; the model, and what files say about the run.
+    """Write the mesh, or save it elsewhere; return the model, and the files' statements about the run.
 
-    Until its file is there, the mesh is kept beside it, as what the file has of each cell is measured before. What of
-    that could not be is left out, and noted in `failed`.
+    Until its file exists, a copy of the mesh is kept beside it, as cell fields are measured before. Measurements that
+    fail are left out, and noted in `failed`.
     """
     plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
     options = stated_options(plan, source.content.image.ndim)
@@ -82,9 +82,9 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
         whole = model_with(task, result.mesh, job, about, labels=result.labels, fields=fields)
         model = with_chosen_sets(whole, job.output, job)
         save_for_solver(job.output, model, job)
-    except TakenError:  # it is kept beside its name
+    except TakenError:  # its message says where the mesh is
         raise
-    except Exception as error:  # hours may have gone into the mesh
+    except Exception as error:  # the mesh may have taken hours
 
         def bare() -> Model:
             options = SolverOptions()
@@ -100,14 +100,14 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
 
 
 def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, str]) -> dict[str, NDArray]:
-    """The fields of the result's cells; those of their shape and their labels alone, if the image's cannot be had."""
+    """Return the fields of the result's cells; only shapes and labels if the image's cannot be computed."""
     if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
         return dict(measured["fields"])
     return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
 
 
 def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> dict[str, Any]:
-    """How well mask, labels, contrasts and sizes are met."""
+    """Measure the fit to mask, labels, contrasts and sizes."""
     source = task.source
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed, source.content)
     if (table := _table_of(source)) is not None and table.names:
@@ -117,7 +117,7 @@ def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[st
 
 
 def _table_of(source: Source) -> LabelTable | None:
-    """Names and colours of the labels that are there."""
+    """Return names and colours of the labels present."""
     if source.labels is None:
         return None
     labels = np.unique(source.labels.data).astype(np.int64)
@@ -127,12 +127,12 @@ def _table_of(source: Source) -> LabelTable | None:
 def numbers_of(
     task: Task, came: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
 ) -> dict[str, Any]:  # fmt: skip
-    """Every number of a run but those that are measured: what run.json begins with."""
+    """Return every number of a run except measurements: the begin of run.json."""
     source = task.source
     table = _table_of(source)
     texts = about if table is None else about | {TABLE_TEXT: table_words(table)}
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
-    summary["image_properties"] = image_summary(source.own)  # on its own voxels, not on divided ones
+    summary["image_properties"] = image_summary(source.own)  # on original voxels, not on divided ones
     summary["request"] = task.request
     if task.by_label is not None:
         made = task.by_label
@@ -143,7 +143,7 @@ def numbers_of(
 
 
 def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
-    """What else is measured of a mesh, by name; None where there is nothing to tell."""
+    """Return further measures of a mesh, by name; their value is None if there is nothing to report."""
     source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
     measures: dict[str, Callable[[], Any]] = {}
     has_image = "n_voxels" in fields
@@ -164,7 +164,7 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
 
 def draw(task: Task, came: Meshed, model: Model) -> None:
     """Draw the pictures."""
-    from tetopt.report import figures, thumbnail  # matplotlib is slow to load, and only needed here
+    from tetopt.report import figures, thumbnail  # matplotlib loads slowly and is needed only here
 
     pictures, mesh, source = task.plan.pictures, came.result.mesh, task.source
     image = source.drawn

@@ -1,1 +1,1 @@
-"""What a solver is told beside the mesh: named sets, modulus mappings and materials, loads, units."""
+"""Solver input in addition to the mesh: named sets, modulus mappings and materials, loads, units."""

@@ -1,13 +1,13 @@
-"""Moduli of cells: averages over their voxels.
+"""Moduli of cells, averaged over their voxels.
 
-Eq. (2) wants the *mean of the modulus field* over each cell. A mapping from intensity to modulus is therefore applied
-to the voxels first and the average taken afterwards; the mapping of the mean intensity is another number wherever the
-mapping is curved and the cell is not uniform.
+Eq. (2) uses the *mean of the modulus field* over each cell. A mapping from intensity to modulus is therefore applied
+to the voxels first, and then averaged; the mapping of the mean intensity differs from this wherever the mapping is
+nonlinear and the cell is not uniform.
 
-The mean is what a mixture has if all of it is strained alike (Voigt, Annalen der Physik 274, 1889, 573-587), and an
-upper bound; the harmonic mean what it has if all of it is stressed alike (Reuss, ZAMM 9, 1929, 49-58), and a lower
-bound (Hill, Proc. Phys. Soc. A 65, 1952, 349-354, who takes the middle of the two). Between them lie the means of
-powers; power 0 is the geometric mean (Lichtenecker, Physikalische Zeitschrift 27, 1926, 115-158).
+The arithmetic mean is the modulus of a mixture under uniform strain (Voigt, Annalen der Physik 274, 1889, 573-587), an
+upper bound; the harmonic mean is the modulus under uniform stress (Reuss, ZAMM 9, 1929, 49-58), a lower bound (Hill,
+Proc. Phys. Soc. A 65, 1952, 349-354, who averages the two). Power means lie between them; power 0 is the geometric
+mean (Lichtenecker, Physikalische Zeitschrift 27, 1926, 115-158).
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
 
-DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md), but in `tetopt paper`, which keeps Eq. (2)
+DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); `tetopt paper` keeps Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
-LARGEST_POWER = 10.0  # either way; beyond it a mean of powers is hardly but the greatest or the least value
-VOXELS_PER_CHUNK = 2**20  # whose places in their cells are computed at once, 100 MB
+LARGEST_POWER = 10.0  # in absolute value; beyond it a power mean is almost the largest or the smallest value
+VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once, 100 MB
 
 
 class Average(NamedTuple):
-    """How one modulus is made of many; what `parse_average` returns."""
+    """A way to average several moduli; returned by `parse_average`."""
 
     words: str  # as a user writes it
-    power: float | None  # of the mean of powers; None: Hill's, halfway between the powers 1 and -1
-    place: Literal["cells", "nodes", "gauss"] = "cells"  # around what: each cell, each node, each Gauss point of a cell
+    power: float | None  # of the power mean; None: Hill's average, halfway between the powers 1 and -1
+    place: Literal["cells", "nodes", "gauss"] = "cells"  # one average per cell, per node, or per Gauss point of a cell
 
 
 def parse_average(text: str) -> Average:
-    """An average from its word.
+    """Parse an average.
 
     Parameters
     ----------
     text : str
-        "mean" (of Eq. (2), Voigt's; power 1), "geometric" (power 0), "harmonic" (Reuss's; power -1), "power:P" with P
-        from -10 to 10, "hill" (halfway between mean and harmonic), "gauss" (geometric around each Gauss point of a
-        cell) or "nodes" (geometric around each node, and linear between nodes).
+        "mean" (Eq. (2), Voigt; power 1), "geometric" (power 0), "harmonic" (Reuss; power -1), "power:P" with P from
+        -10 to 10, "hill" (halfway between mean and harmonic), "gauss" (geometric around each Gauss point of a cell) or
+        "nodes" (geometric around each node, and linear between nodes).
 
     Raises
     ------
     InputError
-        The text is something else.
+        The text is none of these.
 
     Examples
     --------
@@ -80,20 +80,20 @@ def parse_average(text: str) -> Average:
 
 
 def young_image(image: Image, mapping: ModulusMapping) -> Image:
-    """The modulus field: `young_from` of every voxel, kPa, at the image's place in the world.
+    """Return the modulus field, kPa: `young_from` of every voxel, with the affine of the image.
 
-    It can be meshed in place of the image, so that the cells follow the moduli.
+    It can be meshed instead of the image, so that the cells follow the moduli.
 
     Raises
     ------
     InputError
-        As `young_from`.
+        For the reasons of `young_from`.
     """
     return Image(young_from(mapping, image.data), image.affine)
 
 
 def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean") -> NDArray[np.float64]:
-    """Modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
+    """Return the modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
     Parameters
     ----------
@@ -102,17 +102,17 @@ def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average
     mapping : callable, (K, 2) table or None
         From intensity to kPa, see `tetopt.model.mappings.mapped_values`.
     average : str
-        See `parse_average`. "mean" is Eq. (2). With "nodes" it is the mean of `node_young` over the cell's corners, and
-        so over the cell; with "gauss" the geometric mean.
+        See `parse_average`. "mean" is Eq. (2). "nodes" gives the mean of `node_young` over the cell's corners, and thus
+        over the cell; "gauss" gives the geometric mean.
 
-    A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`. A cell of
-    equal moduli has exactly that one, and none is outside of the range of its voxels'.
+    A cell without a voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`. Every
+    average lies within the range of the cell's voxels; if their moduli are equal, it is exactly that modulus.
 
     Raises
     ------
     InputError
-        As `parse_average`, `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh, but for
-        means of powers above 0.
+        For the reasons of `parse_average`, `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in
+        the mesh, except for power means with a power above 0.
     """
     parsed = parse_average(average)
     if parsed.place == "nodes":
@@ -124,35 +124,34 @@ def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average
 
 
 def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np.float64]:
-    """The mean over each cell of any other quantity, such as Poisson's ratio or the density; it may be negative.
+    """Return the mean over each cell of another quantity, such as Poisson's ratio or density; it may be negative.
 
     Raises
     ------
     InputError
-        As `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
+        For the reasons of `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
     """
     seen, owner = _seen(image, mesh)
     values = mapped_values(mapping, seen.data)
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
         raise InputError(
-            f"mapping: it has no value at intensity {at:g}; give one (`nu`, `density`) defined over all intensities "
-            f"within "
-            "the mesh"
+            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined for all intensities "
+            "in the mesh"
         )
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
 
 
 def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDArray[np.float64]:
-    """A modulus for each node, (N,) float64, kPa, that of the cells to be linear between them.
+    """Return the modulus of each node, (N,) float64, kPa, for moduli that are linear within cells.
 
-    The geometric mean of the voxels in the cells around the node, each weighted by the node's hat function at its
-    centre; where no voxel has its centre there, the modulus of the voxel nearest to the node.
+    This is the geometric mean of the voxels in the cells around the node, each weighted by the node's hat function at
+    its centre; if no voxel has its centre there, it is the modulus of the voxel nearest to the node.
 
     Raises
     ------
     InputError
-        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
+        For the reasons of `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
     """
     seen, owner = _seen(image, mesh)
     field = young_image(seen, mapping)
@@ -164,7 +163,7 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
         logarithms = np.log(field.data.ravel()[voxels])[:, None]
         weight += np.bincount(nodes, hats.ravel(), minlength=n_nodes)
         total += np.bincount(nodes, (hats * logarithms).ravel(), minlength=n_nodes)
-    # Within the range of the voxels around, so that equal moduli stay as they are.
+    # Clipped to the range of the surrounding voxels, so that equal moduli stay exact.
     low, high = np.full(n_nodes, np.inf), np.full(n_nodes, -np.inf)
     low_of_cell, high_of_cell = ranges_of(owner, field.data.ravel(), len(mesh.cells))
     for corner in mesh.cells.T:
@@ -179,17 +178,17 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
 def element_young(
     image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
 ) -> NDArray[np.float64]:
-    """Moduli for `tetopt.fem.elasticity.stiffness` of an order: `cell_young` (M,), or at Gauss points (M, Q), kPa.
+    """Return moduli for `tetopt.fem.elasticity.stiffness`: `cell_young` (M,), or at Gauss points (M, Q), kPa.
 
-    The latter with "nodes", see `gauss_young`, and with "gauss" and order 2: each Gauss point, of which one is near
-    each corner, has the geometric mean of the cell's voxels that are nearest to that corner in barycentric coordinates;
-    without any, that of the whole cell. So a quadratic cell has as many moduli as corners, which need
-    not agree with its neighbours', as at an interface they do not.
+    Moduli at Gauss points are returned for "nodes", see `gauss_young`, and for "gauss" with order 2. There each Gauss
+    point lies near one corner and has the geometric mean of the cell's voxels nearest to that corner in barycentric
+    coordinates, or without any, that of the whole cell. A quadratic cell thus has one modulus per corner, independent
+    of its neighbours, as it must be at an interface.
 
     Raises
     ------
     InputError
-        As `cell_young`.
+        For the reasons of `cell_young`.
     """
     place = parse_average(average).place
     if place == "nodes":
@@ -209,22 +208,22 @@ def element_young(
 
 
 def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
-    """Moduli (M, Q) at the Gauss points of each cell of an order, kPa, of moduli (N,) of the mesh's nodes.
+    """Interpolate nodal moduli (N,) to the Gauss points (M, Q) of cells of an order, kPa.
 
-    Linear between a cell's corners, as Abaqus and CalculiX have moduli that depend on a nodal temperature.
+    Moduli are linear within a cell, like temperature-dependent moduli in Abaqus and CalculiX.
     """
     places, _ = gauss_rule(mesh.ndim, order, mesh.midpoints is not None)
     corners = node_young[mesh.cells]
-    # Within their range, so that equal moduli stay as they are.
+    # Clipped to their range, so that equal moduli stay exact.
     low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
 def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
-    """The image as the mesh sees it, and the cell of each voxel, (V,), -1 outside.
+    """Return the image with unused values replaced, and the cell of each voxel, (V,), -1 outside.
 
-    Voxels whose value no average takes get that of one which some do: a mapping need not be one for the air around an
-    organ. Taken are those in cells, and those nearest to nodes and centroids, which stand in for cells without any.
+    Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells without voxels. All
+    other voxels get the value of a used one, because a mapping need not be defined for the air around an organ.
     """
     owner = cell_of_voxel(image, mesh).ravel()
     is_seen = owner >= 0
@@ -239,7 +238,7 @@ def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
 def _places(
     image: Image, mesh: Mesh, owner: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Numbers (K,) of the voxels in the mesh, some at a time, and their cells' hat functions there, (K, n+1)."""
+    """Yield the numbers (K,) of voxels in the mesh and their cells' hat functions there, (K, n+1), in chunks."""
     inside = np.flatnonzero(owner >= 0)
     slopes = volume_gradients(mesh.points, mesh.cells) / volumes(mesh.points, mesh.cells)[:, None, None]
     middle = centroids(mesh.points, mesh.cells)
@@ -248,24 +247,24 @@ def _places(
         cell = owner[voxels]
         centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
         hats = np.einsum("kai,ki->ka", slopes[cell], centres - middle[cell]) + 1.0 / (mesh.ndim + 1)
-        yield voxels, np.maximum(hats, 0.0)  # not below 0 by rounding
+        yield voxels, np.maximum(hats, 0.0)  # rounding could give values below 0
 
 
 def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArray[np.int64]) -> None:
-    """InputError where the average of a modulus of 0 and others would be 0."""
+    """Raise InputError if an average would be 0 because of a single modulus of 0."""
     if average.power is not None and average.power > 0.0:
         return
     empty = np.flatnonzero((owner >= 0) & (field.data.ravel() == 0.0))
     if len(empty):
         raise InputError(
-            f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} voxels of the mesh, as "
-            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus too, as "
-            '`young` "0:0.1,255:6" does, or take `average` mean'
+            f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} voxels of the mesh, e.g. "
+            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus, as in "
+            '`young` "0:0.1,255:6", or use `average` mean'
         )
 
 
 def _of_cells(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None) -> NDArray[np.float64]:
-    """The average over each cell; without any voxel centre in it, the value of the voxel at its centroid."""
+    """Return the average over each cell; a cell without a voxel centre gets the value of the voxel at its centroid."""
     averages, is_empty = _averages(field, owner, power, len(mesh.cells))
     averages[is_empty] = nearest_values(field, centroids(mesh.points, mesh.cells[is_empty]))
     return averages
@@ -274,9 +273,9 @@ def _of_cells(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float |
 def _averages(
     field: Image, owner: NDArray[np.int64], power: float | None, n_parts: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Mean of powers, or Hill's average, of the voxels that each part owns, and whether it has none.
+    """Return the power mean, or Hill's average, of the voxels of each part, and whether the part has none.
 
-    `owner` has a number of a part, or -1, for each voxel.
+    `owner` holds the number of a part, or -1, for each voxel.
     """
     inside = owner >= 0
     part, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
@@ -286,7 +285,7 @@ def _averages(
         averages = 0.5 * sum(_powers(part, values, n_voxels, ranges, each) for each in (1.0, -1.0))
     else:
         averages = _powers(part, values, n_voxels, ranges, power)
-    # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
+    # Clipped to their range, so that a cell of equal values has exactly that value: constants stay one material.
     return np.clip(averages, *ranges), n_voxels == 0
 
 
@@ -297,17 +296,17 @@ def _powers(
     ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
     power: float,
 ) -> NDArray[np.float64]:
-    """The mean of powers of the values that each part owns, (K,); any number where it owns none."""
+    """Return the power mean of the values of each part, (K,); arbitrary for a part without values."""
     count = np.maximum(n_voxels, 1)
     if power == 1.0:
-        # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the
+        # Summed voxel by voxel. `cell_moments` subtracts sums over rows, and their rounding errors would swamp the
         # soft cells of a field that spans ten orders of magnitude.
         return np.bincount(part, weights=values, minlength=len(count)) / count
-    # Each as a ratio to the value that counts most, so that powers are from 0 to 1; and less 1, so that powers near 0
-    # lose no digits on their way to the logarithm.
+    # Ratios to the dominant value, so that powers lie between 0 and 1; minus 1, so that powers near 0 keep their digits
+    # in the logarithm.
     largest = ranges[1] if power > 0.0 else ranges[0]
     largest = np.where((n_voxels > 0) & (largest > 0.0), largest, 1.0)
-    with np.errstate(divide="ignore"):  # a modulus of 0, which means of powers above 0 may take
+    with np.errstate(divide="ignore"):  # a modulus of 0, allowed for powers above 0
         ratios = np.log(values / largest[part])
         less_one = ratios if power == 0.0 else np.expm1(power * ratios)
         means = np.bincount(part, weights=less_one, minlength=len(count)) / count

@@ -1,4 +1,4 @@
-"""A model from a mesh and what a user says of it."""
+"""Construction of a model from a mesh and the user's choices."""
 
 from __future__ import annotations
 
@@ -50,50 +50,50 @@ def build_model(
     box: Box | None = None,
     about: dict[str, Any] | None = None,
 ) -> Model:
-    """All that a solver is told of a mesh, for `tetopt.save_model` and `Model.to_skfem`.
+    """Build the model of a mesh for a solver, for `tetopt.save_model` and `Model.to_skfem`.
 
     Parameters
     ----------
     mesh : Mesh or MeshFile
-        Of a file (`tetopt.load_mesh`) what it holds goes into the model unless it is stated here: data of cells and
-        nodes, labels and their names, sets, moduli, loads, the image's box, and texts of what it was made from. What a
-        solver found stays if moduli and loads do.
+        The contents of a file (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
+        nodes, labels and their names, sets, moduli, loads, the image's box, and texts on its origin. Solver results are
+        kept if moduli and loads are.
     image : Image, optional
-        Its intensities are what mappings are of, and its box's faces become sets.
+        Mappings are applied to its intensities, and the faces of its box become sets.
     young, nu : number, (M,) array, mapping or text, optional
-        Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
-        a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`), of which with an image
-        an average over the voxels of the cell is taken, and else its value at the cell's "mean". Without `young` the
-        model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
+        Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one per cell, or
+        a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`). With an image, a mapping
+        of the intensity is averaged over the voxels of each cell; without, it is applied to the cell's "mean". Without
+        `young` the model has no materials. `nu` defaults to the column "nu" of the file that `young` names, or to 0.45.
     density : number, (M,) array, mapping or text, optional
-        kg/m3, above 0, likewise; without it the column "density" of the file that `young` names, or none. Gravity
-        needs it.
+        Density, kg/m3, above 0, in the same forms; defaults to the column "density" of the file that `young` names, or
+        to none. Gravity needs it.
     average : str
-        Of a mapping of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
-        With "gauss" and quadratic cells moduli vary in a cell for `tetopt.fem.solution.solve`; files have one.
+        The average of Young's modulus over voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
+        With "gauss" and quadratic cells, moduli vary within a cell in `tetopt.fem.solution.solve`, not in files.
         Ratios and densities are always the mean.
     sets : iterable of str
-        Further sets, see `tetopt.model.sets.with_requested`.
+        Additional sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
         See `tetopt.model.loads.parse_loads`.
     bins : int, optional
-        Group cells into so many materials; the error that this makes is in the materials. See
+        Group cells into at most this many materials; the resulting error is stored in the materials. See
         `tetopt.model.materials.binned`.
     spacing : {"equal", "quantile", "log"}
-        How the bins divide the moduli.
+        The spacing of the bins.
     order : {1, 2}, optional
-        By default the file's, or 1. 2: quadratic cells in the file, where a format has them, of straight edges unless
-        the mesh has midpoints, as `mesh_image` with order 2 makes them on interfaces and on a mask's surface.
+        By default the file's, or 1. 2: quadratic cells where a file format has them, with straight edges unless the
+        mesh has midpoints; `mesh_image` with order 2 creates these on interfaces and on a mask's surface.
     cell_data : dict, optional
-        What is known of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields`, and what the
-        file has.
+        Data of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields` and the data of the
+        file.
     known_sets : Sets, optional
-        Sets that came with the mesh, instead of the standard ones.
+        Sets that replace the standard ones.
     box : Box, optional
-        Of the image that the mesh was made from; by default of `image`.
+        The box of the meshed image; by default that of `image`.
     about : dict, optional
-        Texts for the file's head. Its "label_table", a `LabelTable` or what `tetopt.model.labels.table_words` makes of
-        one, is what labels are called, in mappings and in the standard sets.
+        Texts for the file's header. Its "label_table", a `LabelTable` or the result of
+        `tetopt.model.labels.table_words`, gives the names of labels in mappings and in the standard sets.
 
     Returns
     -------
@@ -103,16 +103,16 @@ def build_model(
     Raises
     ------
     InputError
-        As the functions named above; a dimension or an order that there is not; gravity without a density.
+        For the reasons of the functions named above; an invalid dimension or order; gravity without a density.
 
     Warns
     -----
     UserWarning
-        Sets of the file that have to be called otherwise; loads or moduli of it that no longer fit.
+        Sets of the file had to be renamed; its loads or moduli no longer fit.
 
     See Also
     --------
-    save_model : Writes it for a solver.
+    save_model : Write it for a solver.
 
     Examples
     --------
@@ -145,7 +145,7 @@ def build_model(
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(average)
     if image is not None and image.ndim != mesh.ndim:
-        raise InputError(f"image: expected a {mesh.ndim}-D one, as the mesh is, got a {image.ndim}-D one")
+        raise InputError(f"image: expected a {mesh.ndim}-D image, like the mesh, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
     labels = labels_of(cell_data, len(mesh.cells))
     about = _with_table_in_words(about or {}, labels)
@@ -162,30 +162,30 @@ def build_model(
         table = _materials(cells, young, nu, density, average)
         table = table if bins is None else binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
     elif bins is not None:
-        raise InputError("bins: there are no moduli to group; give `young`")
+        raise InputError("bins: the model has no moduli to group; give `young`")
     elif density is not None:
-        raise InputError("density: a material has a modulus, too; give `young`")
+        raise InputError("density: a material also needs a modulus; give `young`")
     parsed = parse_loads(loads, mesh, all_sets)
     if any(load.kind == "gravity" for load in parsed):
-        density_of(table)  # or it is refused
+        density_of(table)  # raises InputError without a density
     model = Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=about)
     return model if loaded is None else _said(completed(model, loaded, is_of_file=is_of_file))
 
 
 def _said(answer: tuple[Any, str]) -> Any:
-    """An answer, of which what was left out becomes a warning."""
+    """Return the value of an answer; warn of its note on dropped data."""
     if answer[1]:
         warn(answer[1])
     return answer[0]
 
 
 def _to_be_kept(loaded: MeshFile, mappings: list[Any], loads: Iterable[str]) -> MeshFile:
-    """The file without what a solver found, if moduli, densities or loads are to be others."""
+    """Return the file without solver results if moduli, densities or loads change."""
     return without_results(loaded) if loads or any(mapping is not None for mapping in mappings) else loaded
 
 
 def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
-    """The texts of a mesh's file that go on into the model."""
+    """Return the texts of a mesh's file that the model keeps."""
     texts: dict[str, Any] = {name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None}
     if loaded.label_table.names or loaded.label_table.colours:
         texts[TABLE_TEXT] = loaded.label_table
@@ -193,7 +193,7 @@ def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
 
 
 def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None) -> dict[str, Any]:
-    """The texts with a table of labels as JSON can hold it, in which all labels of cells have a colour."""
+    """Return the texts with a label table in JSON's types, in which all labels of cells have a colour."""
     table = about.get(TABLE_TEXT)
     if table is None and labels is None:
         return dict(about)
@@ -204,19 +204,19 @@ def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None
 def _sets(
     cells: _ModelCells, box: Box | None, cell_data: dict[str, NDArray], loaded: MeshFile | None, loads: Iterable[str]
 ) -> Sets:
-    """The standard sets, and those of the mesh's file beside them."""
+    """Return the standard sets and those of the mesh's file."""
     if loaded is None:
         return standard_sets(cells.mesh, box, cells.labels, cells.names)
     of_loads = {parse_load(text, cells.mesh.ndim).set_name for text in loads}
     former = loaded.label_table.names
     sets, renamed = sets_beside(cells.mesh, box, cell_data, loaded.sets, cells.names, former, of_loads)
     for old, new in renamed.items():
-        warn(f'the mesh came with a set "{old}" of its own: it is {new} here')
+        warn(f'renamed set "{old}" from the input mesh to "{new}" (name already in use)')
     return sets
 
 
 def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: str) -> Materials:
-    """The materials of mappings; ratio and density by default of the columns of the file that the modulus names."""
+    """Build materials from mappings; ratio and density default to columns of the file that the modulus names."""
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
@@ -230,13 +230,13 @@ def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: s
 def _varying_moduli(
     young: Any, mesh: Mesh, image: Image | None, average: str, order: int, bins: int | None
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """`node_young`, and moduli at Gauss points, of a mapping of the intensity; None but where the average has them."""
+    """Return `node_young` and moduli at Gauss points from a mapping of the intensity; None if the average has none."""
     mapping: Any = parse_any_mapping(young) if isinstance(young, str) else young
     place = parse_average(average).place
     if image is None or not (callable(mapping) or np.ndim(mapping) == 2):
         return None, None
     if place == "nodes" and bins is not None:
-        raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
+        raise InputError(f"bins: moduli that vary within cells cannot be grouped; use another average than {average}")
     return (
         node_young(image, mesh, mapping) if place == "nodes" else None,
         element_young(image, mesh, mapping, average, order)
@@ -246,7 +246,7 @@ def _varying_moduli(
 
 
 class _ModelCells(NamedTuple):
-    """What mappings are of."""
+    """The data of cells that mappings are applied to."""
 
     mesh: Mesh
     image: Image | None
@@ -256,18 +256,18 @@ class _ModelCells(NamedTuple):
 
 
 def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> NDArray[np.float64]:
-    """The value of each cell, or one for all."""
+    """Return the value of each cell, or one for all."""
     mapping: Any = parse_any_mapping(value, name) if isinstance(value, str) else value
     if not callable(mapping) and not isinstance(mapping, ByLabel) and np.ndim(mapping) < 2:
         return np.asarray(mapping, dtype=np.float64)
     if isinstance(mapping, ByLabel):
         return by_label(mapping, cells.labels, cells.names)
-    if cells.image is not None:  # the mapping of each voxel, and then the average, as Eq. (2) wants it
+    if cells.image is not None:  # map each voxel, then average, as in Eq. (2)
         by_voxel = (cells.image, cells.mesh, mapping)
         return cell_young(*by_voxel, average) if name == "young" else cell_values(*by_voxel)
     if cells.mean is None:
-        raise InputError(f"{name}: a mapping of the intensity, but the mesh has no means; give the image (`image`)")
+        raise InputError(f"{name} depends on intensity, but the mesh has no cell means; give the image (`image`)")
     if name == "young" and average != DEFAULT_AVERAGE:
-        raise InputError(f"average: {average} is over the image's voxels; give the image (`image`)")
-    # The mapping of each cell's mean: the same only where the mapping is linear over the cell.
+        raise InputError(f"average: {average} needs the image's voxels; give the image (`image`)")
+    # The mapping of each cell's mean equals the mean of the mapping only where the mapping is linear.
     return young_from(mapping, cells.mean) if name == "young" else mapped_values(mapping, cells.mean)

@@ -1,4 +1,4 @@
-"""What is known of each cell, and what a solver found on cells and nodes."""
+"""Fields of cells, and solver results on cells and nodes."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from tetopt.mesh import Mesh
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2 may follow.
 VECTOR_FIELDS = ("displacement",)
 TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
-NODE_MODULI = "young_nodes"  # point data of our files: moduli that are linear within cells
-GAUSS_MODULI = "young_gauss"  # cell data of our files: moduli at the Gauss points of quadratic cells, a column each
+NODE_MODULI = "young_nodes"  # point data in tetopt's files: moduli that are linear within cells
+GAUSS_MODULI = "young_gauss"  # cell data in tetopt's files: moduli at Gauss points of quadratic cells, one per column
 STRESS_FIELDS = ("young", NODE_MODULI, GAUSS_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
 def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
-    """What the mesh file holds of each cell.
+    """Return the standard fields of each cell, as written to mesh files.
 
     Parameters
     ----------
     mesh : Mesh
         Points in world mm.
     image : Image, optional
-        Without it the fields of the image are left out.
+        Without it, the fields of the image are omitted.
 
     Returns
     -------
     dict of (M,) arrays
-        "volume", mm^n; "rho", the radius ratio; "min_dihedral", the smallest angle, degrees; of the image, in its unit,
-        "mean", "variance" (squared), "n_voxels", "min" and "max".
+        "volume", mm^n; "rho", the radius ratio; "min_dihedral", the smallest angle, degrees; with an image, in its
+        unit, "mean", "variance" (unit squared), "n_voxels", "min" and "max".
 
     Raises
     ------
     InputError
-        As `cell_moments`.
+        For the reasons of `cell_moments`.
 
     Examples
     --------
@@ -65,15 +65,15 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
 
 
 def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
-    """A field with a row for each node of the order (1: the mesh's; 2: those of `quadratic`).
+    """Return a field with one row per node of the order (1: the mesh's nodes; 2: those of `quadratic`).
 
-    Of rows for the mesh's nodes alone the middle of an edge has the mean of its ends; rows for more than the order has
-    are left out.
+    If there are rows only for the mesh's nodes, the middle of an edge gets the mean of its ends; rows beyond the nodes
+    of the order are dropped.
 
     Raises
     ------
     InputError
-        Neither so many rows as the mesh has nodes, nor as many as order 2 has.
+        The number of rows is neither that of the mesh's nodes nor that of order 2.
     """
     values, n_corners = np.asarray(values), len(mesh.points)
     if order == 1 and len(values) == n_corners:
@@ -82,7 +82,7 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
     n_nodes = int(cells.max()) + 1
     if len(values) not in (n_corners, n_nodes):
         raise InputError(
-            f"point data: expected a row for each of {n_corners} corner nodes or of {n_nodes} in all, got {len(values)}"
+            f"point data: expected one row per corner node ({n_corners}) or per node ({n_nodes}), got {len(values)}"
         )
     if order == 1 or len(values) == n_nodes:
         return values[: n_corners if order == 1 else n_nodes]
@@ -94,9 +94,9 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
 
 
 def half_turned_fields(fields: dict[str, NDArray]) -> dict[str, NDArray]:
-    """3-D fields by name, a row each cell or node, from RAS+ to LPS+ or back: vectors and tensors (row by row) change.
+    """Transform 3-D vectors and tensors (row by row) among named fields from RAS+ to LPS+ or back.
 
-    Raises nothing: a field of such a name but of another shape is another program's, and stays.
+    Fields with such a name but another shape come from other programs and are not changed.
     """
     turned = dict(fields)
     for name, values in fields.items():
@@ -109,17 +109,17 @@ def half_turned_fields(fields: dict[str, NDArray]) -> dict[str, NDArray]:
 
 
 def is_result(name: str) -> bool:
-    """Whether a field of this name is what a solver found."""
+    """Return whether a field of this name is a solver result."""
     return _base_name(name) in (*VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises", "von_mises_nodes")
 
 
 def is_stress(name: str) -> bool:
-    """Whether a field of this name is a modulus or a stress."""
+    """Return whether a field of this name is a modulus or a stress."""
     return _base_name(name) in STRESS_FIELDS
 
 
 def stresses_times(factor: float, fields: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Fields by name, moduli and stresses in another unit."""
+    """Convert moduli and stresses among named fields to another unit."""
     return {name: values * factor if is_stress(name) else values for name, values in fields.items()}
 
 

@@ -1,4 +1,4 @@
-"""What came with a mesh from its file, and what of it a model takes over."""
+"""The contents of a mesh's file, and the parts of them that a model keeps."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
 from tetopt.model.sets import Box, Sets, label_sets, merged_sets, standard_sets
 from tetopt.system.incoming import json_of
 
-MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # of cells of a file of ours
-MODULUS_ROUNDING = 1e-9  # relative: of a cell's modulus beside those at its Gauss points, in files of other units
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
+MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # cell data in tetopt's files
+MODULUS_ROUNDING = 1e-9  # relative, between a cell's modulus and those at its Gauss points, in files of other units
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # texts of a mesh's file that are kept in the new one
 
 
 class MeshFile(NamedTuple):
-    """A mesh read from a file and what came with it.
+    """A mesh read from a file, with the other contents of the file.
 
     Parameters
     ----------
     mesh : Mesh
         RAS+ mm.
     cell_data : dict of arrays
-        By name, one row a cell; "young", if the file has it, in kPa.
+        By name, one row per cell; "young", if the file has it, in kPa.
     field_data : dict of arrays
-        By name, of any length; bytes of UTF-8 have become one string.
+        By name, of any length; UTF-8 bytes are decoded to one string.
     n_turned : int
-        Cells that were oriented the other way in the file.
+        Number of cells that were inverted in the file.
     n_left : int
-        Cells of lower dimension, triangles on tetrahedra among them, that were left out.
+        Number of cells of lower dimension, such as triangles on tetrahedra, that were dropped.
     sets : Sets
-        Of facets and cells, by name.
+        Sets of facets and cells, by name.
     box : Box, optional
-        Of the image that the mesh was made from.
+        Box of the meshed image.
     space : {"ras", "lps"}
-        Of the file: from "lps" the mesh has been turned to RAS+.
+        Axes of the file; a mesh in "lps" has been transformed to RAS+.
     notes : tuple of str
-        What was left out or renamed, a line each.
+        One line for each item that was dropped or renamed.
     order : {1, 2}
-        Of the file's cells; of those of order 2 the mesh has the corners.
+        Order of the file's cells; for order 2 the mesh has their corners.
     point_data : dict of arrays
-        By name, a row for each node of the order.
+        By name, one row per node of the order.
 
     Examples
     --------
@@ -72,20 +72,20 @@ class MeshFile(NamedTuple):
     space: str = "ras"
     notes: tuple[str, ...] = ()
     order: int = 1
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
 
     def text(self, name: str) -> str | None:
-        """A text among the field data, if it is there.
+        """Return a text from the field data, if present.
 
         Parameters
         ----------
         name : str
-            Of the field data.
+            Name in the field data.
 
         Returns
         -------
         str or None
-            None if it is not there, or no text.
+            None if it is missing or not a text.
 
         Examples
         --------
@@ -98,7 +98,7 @@ class MeshFile(NamedTuple):
         return text_in(self.field_data, name)
 
     def _repr_html_(self) -> str:
-        """What the file holds, with the middle section by its means, for a notebook."""
+        """Show the contents of the file in a notebook, with the middle section shaded by cell means."""
         mesh = self.mesh
         rows = notebook.mesh_rows(mesh.points, mesh.cells)
         rows += [("data of cells", ", ".join(self.cell_data) or "none")]
@@ -112,21 +112,21 @@ class MeshFile(NamedTuple):
 
     @property
     def label_table(self) -> LabelTable:
-        """Names and colours of labels that the file keeps; empty without any."""
+        """Names and colours of labels in the file; empty if there are none."""
         return table_in(self.text(TABLE_TEXT))
 
 
 def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
-    """A text among a file's field data."""
+    """Return a text from a file's field data, None if it is missing."""
     values = field_data.get(name, np.empty(0))
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
 def table_in(text: str | None) -> LabelTable:
-    """The table in a text of a mesh's file, as `tetopt.model.labels.table_words` has it; empty for any other text."""
+    """Parse a label table written by `tetopt.model.labels.table_words`; empty for any other text."""
     try:
         return table_of_words(json_of(text or "{}"))
-    except ValueError:  # another program's
+    except ValueError:  # written by another program
         return table_of_words({})
 
 
@@ -139,10 +139,10 @@ def sets_beside(
     former: Mapping[int, str] | None = None,
     kept: Iterable[str] = (),
 ) -> tuple[Sets, dict[str, str]]:
-    """The standard sets and the mesh's own; and which of the latter had to be called otherwise, by old name.
+    """Return the standard sets together with the mesh's own, and the new names of own sets, by old name.
 
-    Labels are called as `names` says. Sets of labels, and interfaces, under their numbers or `former` names are not
-    there a second time, but those that loads name (`kept`).
+    `names` gives the names of labels. Own sets of labels and interfaces under their numbers or `former` names are
+    dropped as duplicates, except those that loads refer to (`kept`).
     """
     labels = labels_of(fields, len(mesh.cells))
     if labels is not None and names and (own.facets or own.cells):
@@ -159,22 +159,22 @@ def sets_beside(
 
 
 def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
-    """The loads that a file of ours holds, in the words of `loads`, in RAS+ and kPa, if their sets are there still; and
-    in words why there are none, if so."""
+    """Return the loads in a file of tetopt's as text, in RAS+ and kPa, if their sets still exist; and otherwise why
+    they were dropped."""
     try:
         words = json_of(loaded.text("loads") or "[]")
         loads = [parse_load(text, loaded.mesh.ndim) for text in words]
-    except (ValueError, TypeError, AttributeError):  # another program's
+    except (ValueError, TypeError, AttributeError):  # written by another program
         return [], ""
     if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
-        return [], f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"
+        return [], f"dropped the file's loads: it no longer has the sets {', '.join(lost)}"
     factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
     return [load_words(scaled(load, factor)) for load in turned], ""
 
 
 def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any) -> tuple[Any, Any, Any]:
-    """Mappings of modulus, ratio and density; without the first those that the cells have, whichever is not stated."""
+    """Return mappings of modulus, ratio and density; without a modulus, missing ones are taken from the cells."""
     if young is not None or "young" not in cell_data:
         return young, nu, density
     stated = {"nu": nu, "density": density}
@@ -185,8 +185,8 @@ def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: An
 
 
 def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Model, str]:
-    """The model with what the mesh's file alone has: data at nodes and, if the moduli are the file's, those that vary
-    within cells, and the error of those that stand for more; and in words what of it does not fit."""
+    """Add the data that only the mesh's file has: data of nodes and, if the moduli are the file's, moduli that vary
+    within cells and the binning error. Also return a note on data that do not fit."""
     model = model._replace(point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI})
     if (table := model.materials) is None or not is_of_file:
         return model, ""
@@ -195,26 +195,26 @@ def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Mode
     table = table._replace(binning=_binning_error(loaded))
     at_gauss = _gauss_moduli(model, loaded)
     lost = at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data
-    words = f"{GAUSS_MODULI} of the mesh's file is left out: it does not belong to its cells and their young"
+    words = f"dropped {GAUSS_MODULI} of the mesh's file: it does not match the cells and their young"
     return model._replace(materials=table, gauss_young=at_gauss), words if lost else ""
 
 
 def _binning_error(loaded: MeshFile) -> BinningError | None:
-    """How far the moduli of a file of ours are from those that they stand for, if it tells."""
+    """Return the binning error in a file of tetopt's, None if there is none."""
     try:
         words = json_of(loaded.text("binning") or "{}")
         return BinningError(float(words["mean"]), float(words["largest"]))
-    except (ValueError, TypeError, KeyError, RecursionError):  # there is none, or it is another program's
+    except (ValueError, TypeError, KeyError, RecursionError):  # missing, or written by another program
         return None
 
 
 def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
-    """The moduli at Gauss points (M, Q) that a file of ours holds, if they are still those of its cells."""
+    """Return the moduli at Gauss points (M, Q) in a file of tetopt's, if they still match its cells."""
     moduli = loaded.cell_data.get(GAUSS_MODULI)
     if moduli is None or model.order == 1 or model.materials is None:
         return None
     of_cell, shape = model.materials.young[model.materials.of_cell], (len(model.mesh.cells), model.mesh.ndim + 1)
-    # A cell's own modulus is a mean of these; columns go by a cell's nodes, which turning exchanges.
+    # A cell's own modulus is a mean of these; columns follow a cell's nodes, which reorienting swaps.
     if moduli.shape == shape and not loaded.n_turned:
         low, high = moduli.min(axis=1), moduli.max(axis=1)
         if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (of_cell <= (1.0 + MODULUS_ROUNDING) * high).all():
@@ -224,7 +224,7 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
 
 
 def without_results(loaded: MeshFile) -> MeshFile:
-    """The mesh's file without what a solver found on its cells and nodes."""
+    """Return the mesh's file without solver results on cells and nodes."""
     cell_data, point_data = (
         {name: rows for name, rows in data.items() if not is_result(name)}
         for data in (loaded.cell_data, loaded.point_data)

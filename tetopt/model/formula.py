@@ -1,4 +1,4 @@
-"""Formulas of the intensity h, as written on a command line, without evaluating anyone's code."""
+"""Formulas of the intensity h, as written on a command line, parsed without executing code."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
-MOST_FORMULA_LETTERS = 10_000  # far more than anyone writes; Python's parser takes half a minute for a million
-MOST_NESTED_OPERATIONS = 100  # more than anyone writes, and well within Python's own limit of recursion
+MOST_FORMULA_LETTERS = 10_000  # far more than any real formula; Python's parser takes half a minute for a million
+MOST_NESTED_OPERATIONS = 100  # more than any real formula, and well within Python's recursion limit
 FORMULA_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
     "min": (np.minimum, 2), "max": (np.maximum, 2),
@@ -27,15 +27,15 @@ FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTI
 
 
 def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """A function of the intensities from a formula of h; operators and precedence are Python's.
+    """Convert a formula of h to a function of intensities; operators and precedence are Python's.
 
-    Allowed are numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and ``log`` of one argument,
-    ``min`` and ``max`` of two. Where a formula has no value (1/0, the logarithm of 0) the function returns inf or NaN.
+    Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and ``log`` of one argument,
+    and ``min`` and ``max`` of two. Where a formula is undefined (1/0, log of 0) the function returns inf or NaN.
 
     Raises
     ------
     InputError
-        Anything else in the text.
+        The text contains anything else.
 
     Examples
     --------
@@ -43,10 +43,10 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     array([  50.,  100., 1000.])
     """
     if len(text) > MOST_FORMULA_LETTERS:
-        raise InputError(f'formula: more than {MOST_FORMULA_LETTERS} letters: "{_shown(text[:1000])}"')
+        raise InputError(f'formula: expected at most {MOST_FORMULA_LETTERS} letters, got "{_shown(text[:1000])}"')
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # of "1if h" Python only warns
+            warnings.simplefilter("error")  # for "1if h" Python only issues a warning
             tree = ast.parse(text.strip(), mode="eval").body
         value = _compiled(tree, text, 0)
     except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:
@@ -55,28 +55,28 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
         raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
 
     def mapping(h: NDArray[np.float64]) -> NDArray[np.float64]:
-        with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
+        with np.errstate(all="ignore"):  # undefined values are refused where the modulus is used
             return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
     return mapping
 
 
 def _shown(text: str) -> str:
-    """A formula on one line, cut short."""
+    """Format a formula on one line, truncated."""
     line = " ".join(text.split())
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
 def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
-    """The function of h that a tree stands for.
+    """Convert a syntax tree to a function of h.
 
-    InputError unless the tree is made of what is allowed, and no deeper than `MOST_NESTED_OPERATIONS`.
+    InputError if the tree contains anything not allowed, or is deeper than `MOST_NESTED_OPERATIONS`.
     """
     if depth > MOST_NESTED_OPERATIONS:
-        raise InputError(f'formula: more than {MOST_NESTED_OPERATIONS} operations deep: "{_shown(text)}"')
+        raise InputError(f'formula: expected at most {MOST_NESTED_OPERATIONS} nested operations, got "{_shown(text)}"')
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
-            number = np.float64(value)  # OverflowError for a whole number beyond 1e308
+            number = np.float64(value)  # OverflowError for integers beyond 1e308
             return lambda h: number
         case ast.Name(id="h"):
             return lambda h: h

@@ -1,4 +1,4 @@
-"""Labels by name: a table of names and colours, and which labels a name means."""
+"""Label tables with names and colours, and the labels that a name refers to."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tetopt.contents.labels import colours_by_number, hex_colour
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
 
-TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `table_words` makes
+TABLE_TEXT = "label_table"  # key in a mesh's file and in a model's `about` for the result of `table_words`
 
-LABEL_DIGITS = 18  # of a number that 64 bits hold; more are a name that nothing has
+LABEL_DIGITS = 18  # of a number that fits into 64 bits; a longer one counts as a name
 
 
 class LabelTable(NamedTuple):
-    """Names and colours of labels; a label may have one of them, or neither.
+    """Names and colours of labels; a label may lack either or both.
 
     Parameters
     ----------
     names : dict of int to str
-        Any text on one line; two labels may have the same.
+        Any one-line text; two labels may have the same name.
     colours : dict of int to (float, float, float)
         Red, green and blue, 0 to 1.
 
@@ -39,23 +39,23 @@ class LabelTable(NamedTuple):
     colours: dict[int, tuple[float, float, float]]
 
 
-NO_TABLE = LabelTable({}, {})  # of labels that only have numbers
+NO_TABLE = LabelTable({}, {})  # for labels that only have numbers
 
 
 def label_words(label: int, names: Mapping[int, str]) -> str:
-    """A label as it is told: "5 (liver)", or "5" if it has no name."""
+    """Format a label: "5 (liver)", or "5" if it has no name."""
     return f"{label} ({names[label]})" if label in names else f"{label}"
 
 
 def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
-    """The labels that a text means, ascending: those of this name, or the one whose set is called so.
+    """Return the labels, ascending, that a text refers to: those with this name, or the one whose set has this name.
 
-    Capitals do not matter where no label has the name exactly. A whole number is that label.
+    Case is ignored if no label has exactly this name. A whole number refers to the label with this number.
 
     Raises
     ------
     InputError
-        No label has such a name, with those nearest to it.
+        No label has such a name; the message lists similar ones.
 
     Examples
     --------
@@ -73,16 +73,16 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
             if labels := sorted(label for label, name in known.items() if same(name.strip()) == same(text)):
                 return labels
     if not names:
-        raise InputError(f'label "{text}": no label has a name; give a table of them (`label_names`)')
+        raise InputError(f'label "{text}": labels have no names; give a table of names (`label_names`)')
     lower = {name.lower(): name for name in (*of_sets.values(), *names.values())}
     near = [lower[each] for each in difflib.get_close_matches(text.lower(), lower, 3)]
     first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")
-    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {first}"
-    raise InputError(f'label "{text}": no label is called so; {hint}')
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known names are {first}"
+    raise InputError(f'label "{text}": no label has this name; {hint}')
 
 
 def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
-    """The field "label", (M,) int64, if it is there and holds whole numbers from 0, as other programs' may not."""
+    """Return the field "label", (M,) int64, if it exists and holds whole numbers from 0; other programs' may not."""
     labels = cell_data.get("label")
     if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
         return None
@@ -91,7 +91,7 @@ def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int6
 
 
 def table_words(table: LabelTable) -> dict[str, dict[str, str]]:
-    """The table as JSON can hold it: by label, "name" and "colour" ("#rrggbb"), as far as it has them."""
+    """Convert a table to JSON's types: by label, its "name" and "colour" ("#rrggbb") if it has them."""
     words: dict[str, dict[str, str]] = {str(label): {} for label in sorted({*table.names, *table.colours})}
     for label, name in table.names.items():
         words[str(label)]["name"] = name
@@ -101,7 +101,7 @@ def table_words(table: LabelTable) -> dict[str, dict[str, str]]:
 
 
 def table_of_words(words: Any) -> LabelTable:
-    """The table that `table_words` was made of, colours to 1/255; what is not of that kind is left out."""
+    """Convert the result of `table_words` back to a table, with colours to 1/255; invalid entries are ignored."""
     names, colours = {}, {}
     for label, entry in words.items() if isinstance(words, dict) else ():
         if re.fullmatch(r"\d{1,9}", str(label)) is None or not isinstance(entry, dict):
@@ -114,14 +114,14 @@ def table_of_words(words: Any) -> LabelTable:
 
 
 def coloured(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
-    """The table with the colour that each of these labels has in pictures; 0, the background, is light grey there."""
+    """Add the colours that labels have in pictures to the table; 0, the background, is light grey."""
     those = np.unique(labels)
     by_number = dict(zip(those.tolist(), map(tuple, colours_by_number(those).tolist()), strict=True))
     return LabelTable(table.names, by_number | {label: own for label, own in table.colours.items() if label != 0})
 
 
 def table_of_labels(table: LabelTable, labels: Iterable[int]) -> LabelTable:
-    """The entries of these labels alone."""
+    """Return a table with only the entries of these labels."""
     few = set(labels)
     return LabelTable(
         {label: name for label, name in table.names.items() if label in few},

@@ -1,8 +1,7 @@
-"""Loads as written on a command line: what holds facet sets, moves them, presses, pulls or weighs, in steps.
+"""Loads as written on a command line: supports, displacements, pressures, tractions, springs and gravity, in steps.
 
-Each step is a load case of its own, from the undeformed state; a load without a step is in all of them. What pushes
-facets acts on their nodes, by `facet_weights`, which solvers and writers share, so that all of them solve the same
-equations.
+Each step is a separate load case from the undeformed state; a load without a step belongs to all steps. Loads on facets
+act on their nodes by `facet_weights`, which solvers and writers share, so that all of them solve the same equations.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
 
-PLANE_FRACTION = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
-MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
+PLANE_FRACTION = 1.0 - 1e-6  # the sum of area vectors of a flat set is at least this fraction of its area
+MOST_COMPRESSION_PERCENT = 50.0  # more is beyond a linear step
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
-# By kind, what follows SET: how the numbers are written (n stands for one a dimension), and their unit.
+# By kind: the form of the arguments, the count of numbers (n: one per dimension), and their unit.
 LOAD_FORMS = {
     "move": ("SET:X,Y,Z", "n", "mm or free"),
     "pressure": ("SET:P", "1", "kPa"),
@@ -38,29 +37,29 @@ LOAD_FORMS = {
     "spring": ("SET:K", "1", "kPa/mm"),
     "gravity": ("X,Y,Z", "n", "mm/s2"),
 }
-SHOWN_LOAD_DIGITS = 10  # of a load's numbers where they are printed: rounding, as in 9.450000000000001, is not seen
+SHOWN_LOAD_DIGITS = 10  # of a load's numbers in print, which hides rounding such as in 9.450000000000001
 FACET_FORCES = ("pressure", "traction", "spring")  # kinds that act on facets from outside
 
 
 class Load(NamedTuple):
     """One load, of one kind.
 
-    - "displacement": the nodes of the set move by `numbers` (n,), mm; 0 holds them, NaN leaves a component free.
-    - "pressure": (1,) kPa, against the facets, inwards, along their undeformed normals.
-    - "traction": (n,) kPa, force by undeformed area along the world's axes.
-    - "spring": (1,) kPa/mm, stiffness by area of what surrounds the set, the same in all directions.
-    - "gravity": (n,) mm/s2, acts on all cells, whose materials have a density.
+    - "displacement": the nodes of the set move by `numbers` (n,), mm; 0 fixes them, NaN leaves a component free.
+    - "pressure": (1,) kPa, acts inwards on the facets, along their undeformed normals.
+    - "traction": (n,) kPa, force per undeformed area along the world's axes.
+    - "spring": (1,) kPa/mm, stiffness per area of the set's surroundings, the same in all directions.
+    - "gravity": (n,) mm/s2, acts on all cells; their materials need a density.
 
     Parameters
     ----------
     kind : {"displacement", "pressure", "traction", "spring", "gravity"}
-        As above.
+        See above.
     set_name : str
         A facet set; "" for gravity.
     numbers : (n,) or (1,) float64
         In the model's units and space.
     step : int
-        0: in every step; 1, 2, ...: in that one alone.
+        0: in all steps; 1, 2, ...: in that step only.
 
     Examples
     --------
@@ -82,24 +81,24 @@ class Load(NamedTuple):
 
 
 def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...]:
-    """Loads from words.
+    """Parse loads.
 
     Parameters
     ----------
     texts : iterable of str
-        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which holds the side
+        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which fixes the side
         with the largest z and moves the opposite one towards it by 5 % of the distance between the two, as `tetopt
         fem` does; "pressure:SET:P", kPa, inwards; "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm;
-        "gravity:X,Y,Z", mm/s2. A prefix "2/" puts a load into step 2 alone; others are in every step. Forces on the
-        same facets add up.
+        "gravity:X,Y,Z", mm/s2. The prefix "2/" puts a load into step 2 only; without a prefix it is in all steps.
+        Forces on the same facets add up.
     mesh : Mesh
     sets : Sets
 
     Raises
     ------
     InputError
-        Other words or numbers; a set that is not there; steps that leave one out; a component of a node's displacement
-        that is prescribed twice in a step; forces on facets between two cells.
+        Invalid words or numbers; an unknown set; missing step numbers; a component of a node's displacement that is
+        prescribed twice in a step; forces on facets between two cells.
     """
     loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
     check_steps(loads)
@@ -112,33 +111,33 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
 
 
 def count_of_steps(loads: Iterable[Load]) -> int:
-    """How many steps there are: 1 if no load is of one alone."""
+    """Return the number of steps: 1 if no load belongs to a single step."""
     return max([1, *(load.step for load in loads)])
 
 
 def in_step(loads: Iterable[Load], step: int) -> tuple[Load, ...]:
-    """The loads of a step, from 1: its own, and those of all."""
+    """Return the loads of a step, from 1: its own and those of all steps."""
     return tuple(load for load in loads if load.step in (0, step))
 
 
 def check_steps(loads: Iterable[Load]) -> None:
-    """InputError if steps leave a number out; step 1 may have the loads of all steps alone."""
+    """Raise InputError if a step number is missing; step 1 may have only the loads of all steps."""
     steps = {load.step for load in loads}
     numbers = sorted(steps | {1} if 0 in steps else steps)[0 in steps :]
     for expected, number in enumerate(numbers, start=1):
         if number != expected:
             raise InputError(
-                f"load: there is a step {numbers[-1]}, but no load is of step {expected} alone; number steps from 1"
+                f"load: loads have a step {numbers[-1]}, but none has step {expected}; number steps from 1"
             )
 
 
 def parse_load(text: str, ndim: int) -> Load:
-    """A load from words, see `parse_loads`, before any set is looked for; "compress" is a kind still, in per cent.
+    """Parse a load, see `parse_loads`, without looking up sets; "compress" is kept as a kind, in percent.
 
     Raises
     ------
     InputError
-        Other words or numbers.
+        Invalid words or numbers.
     """
     step, words = _step_of(text)
     kind, _, rest = words.partition(":")
@@ -166,7 +165,7 @@ def parse_load(text: str, ndim: int) -> Load:
 
 
 def load_words(load: Load, digits: int = 17) -> str:
-    """A load in the words of `parse_loads`, to the last bit, or with so many significant digits to be read.
+    """Format a load for `parse_loads`, exactly by default, or with fewer significant digits for display.
 
     Examples
     --------
@@ -187,17 +186,17 @@ def load_words(load: Load, digits: int = 17) -> str:
 
 
 def _step_of(text: str) -> tuple[int, str]:
-    """The step, 0 for all, and the words behind it."""
+    """Return the step, 0 for all, and the text after it."""
     prefix, slash, words = text.partition("/")
     if not slash or ":" in prefix:
         return 0, text
     if not re.fullmatch("[1-9][0-9]{0,3}", prefix):
-        raise InputError(f'load: expected a step of 1 or more before the stroke, as in 2/{words}, got "{text}"')
+        raise InputError(f'load: expected a step of 1 or more before the slash, as in 2/{words}, got "{text}"')
     return int(prefix), words
 
 
 def _moved(text: str) -> NDArray[np.float64]:
-    """Numbers between commas, NaN where the word is free; none if there is anything else."""
+    """Parse comma-separated numbers, NaN for the word free; empty for any other text."""
     parts = [part.strip() for part in text.split(",")]
     is_free = np.array([part == FREE_WORD for part in parts])
     numbers = finite_numbers(",".join("0" if free else part for part, free in zip(parts, is_free, strict=True)))
@@ -212,26 +211,26 @@ def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def known_set(name: str, sets: Sets) -> str:
-    """The name of a facet set.
+    """Return the name of a facet set after checking it.
 
     Raises
     ------
     InputError
-        There is none of that name.
+        No facet set has this name.
     """
     if name in sets.facets:
         return name
     if name in sets.cells:
         first = ", ".join(list(sets.facets)[:8])
-        raise InputError(f'load: "{name}" is a set of cells; give one of facets, such as {first}')
+        raise InputError(f'load: "{name}" is a set of cells; give a set of facets, such as {first}')
     similar = [each for each in sets.facets if each.lower() == name.lower()] or other_orders(name, sets)
     similar = similar or difflib.get_close_matches(name, sets.facets, 1)
-    hint = f"did you mean {similar[0]}?" if similar else f"there are {', '.join(sets.facets)}"
-    raise InputError(f'load: there is no set of facets "{name}"; {hint}')
+    hint = f"did you mean {similar[0]}?" if similar else f"known sets are {', '.join(sets.facets)}"
+    raise InputError(f'load: no set of facets "{name}"; {hint}')
 
 
 def other_orders(name: str, sets: Sets) -> list[str]:
-    """The facet sets of the same words in another order, as an interface named from its other side would be."""
+    """Return facet sets with the same words in another order, as for an interface named from its other side."""
     words = sorted(name.lower().split("_"))
     return [each for each in sets.facets if each != name and sorted(each.lower().split("_")) == words]
 
@@ -240,7 +239,7 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
     low, high = FACE_NAMES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
-            f"load: compress presses {low} towards {high}, but no facet of the mesh is {' or '.join(missing)}; use "
+            f"load: compress moves {low} towards {high}, but the mesh has no facets {' or '.join(missing)}; use "
             f"hold:SET and move:SET:X,Y,Z with sets of {', '.join(sets.facets)}"
         )
     push = 0.01 * float(load.numbers[0]) * _across(mesh, sets, low, high)
@@ -251,14 +250,14 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
-    """From the outermost node of one side to that of the opposite one, along `_upwards`, (n,) mm."""
+    """Return the vector from the outermost node of one side to that of the opposite, along `_upwards`, (n,) mm."""
     upwards = _upwards(mesh, sets, low, high)
     bottom, top = ((mesh.points[nodes_of(mesh, sets.facets[name])] * upwards).sum(axis=1) for name in (low, high))
     return upwards * float(top.max() - bottom.min()) + 0.0  # + 0.0: no -0
 
 
 def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
-    """The direction from one side to the opposite one, (n,): the normal of one that is flat, else the world's axis."""
+    """Return the direction from one side to the opposite, (n,): the normal of a flat side, else the world's axis."""
     for name, sign in ((low, -1.0), (high, 1.0)):
         areas = area_vectors(mesh, sets.facets[name])
         total = sign * areas.sum(axis=0)
@@ -272,8 +271,8 @@ def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
     rows, shared = sets.facets[load.set_name], facets(mesh.cells)
     if inner := int((shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] > 1).sum()):
         raise InputError(
-            f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two cells, where nothing '
-            f"outside can act ({load.kind}); take a set of the boundary, mesh one side alone (`mask`), or move the set"
+            f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two cells, where no external '
+            f"{load.kind} can act; use a boundary set, mesh only one side (`mask`), or move the set"
         )
 
 
@@ -285,8 +284,8 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
         twice = (is_prescribed[nodes] & components).any(axis=1)
         if twice.any():
             raise InputError(
-                f'load: {int(twice.sum())} nodes of set "{load.set_name}" are in another loaded set, too, and '
-                "cannot go both ways; take sets apart, such as `sets` NAME=plane:X,Y,Z:NX,NY,NZ:D"
+                f'load: {int(twice.sum())} nodes of set "{load.set_name}" already have a prescribed displacement from '
+                "another set; use disjoint sets, such as `sets` NAME=plane:X,Y,Z:NX,NY,NZ:D"
             )
         is_prescribed[nodes] |= components
 
@@ -295,10 +294,10 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
 
 
 def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Nodes of facets and the integrals of their shape functions over the facets, (K, w) each.
+    """Return the nodes of facets and the integrals of their shape functions over the facets, (K, w) each.
 
-    What a constant traction does to each node, mm2 (in 2-D mm, by mm of thickness); see Zienkiewicz and Taylor, The
-    Finite Element Method, volume 1, on consistent nodal forces.
+    These are the nodal weights of a constant traction, mm2 (in 2-D mm, per mm of thickness); see Zienkiewicz and
+    Taylor, The Finite Element Method, volume 1, on consistent nodal forces.
 
     Parameters
     ----------
@@ -306,10 +305,10 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
     rows : (K, 2) int64
         Facets, see `tetopt.model.sets`.
     order : {1, 2}
-        Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D a facet's area A then goes to the
-        midpoints of its edges, A/3 each, and nothing to its corners; in 2-D an edge's length is shared as Simpson's
-        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same part. Curved facets are
-        integrated by `tetopt.geometry.quadratic.curved_rule`.
+        Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D the midpoints of a facet's edges get
+        a third of its area each, and the corners nothing; in 2-D the length L of an edge is divided by Simpson's rule,
+        L/6, L/6 and 4 L/6 in the middle. For order 1 all corners get the same part. Curved facets are integrated with
+        `tetopt.geometry.quadratic.curved_rule`.
     """
     if order == 2 and mesh.midpoints is not None:
         nodes, shapes, normals = _curved_facets(mesh, rows)
@@ -327,8 +326,8 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
 def _curved_facets(
     mesh: Mesh, rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes (K, w) of curved facets of order 2, shape functions (Q, w) at the points of a rule, and outward normals
-    there as long as the part of the facet (in 2-D of the edge) that a point stands for, (Q, K, n)."""
+    """Return the nodes (K, w) of curved facets of order 2, shape functions (Q, w) at quadrature points, and outward
+    normals (Q, K, n) there, scaled to the area (in 2-D the length) that each point represents."""
     points, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
     nodes = quadratic_facet_nodes(cells, rows)
     places, weights = curved_rule(mesh.ndim - 1)
@@ -340,9 +339,9 @@ def _curved_facets(
 
 
 def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """What a pressure or traction does to nodes: their numbers (P,), ascending, and forces (P, n), mN if it is in kPa.
+    """Return the nodes (P,), ascending, and nodal forces (P, n) of a pressure or traction, mN for a load in kPa.
 
-    Nodes whose part is 0 are left out.
+    Nodes with zero weight are omitted.
     """
     rows = sets.facets[load.set_name]
     if load.kind == "pressure" and order == 2 and mesh.midpoints is not None:
@@ -361,14 +360,14 @@ def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[ND
 def spring_constants(
     mesh: Mesh, sets: Sets, load: Load, order: int = 1
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The springs from nodes to the ground: numbers (P,), ascending, and stiffness (P,), mN/mm if it is in kPa/mm."""
+    """Return the springs to the ground: nodes (P,), ascending, and stiffness (P,), mN/mm for a load in kPa/mm."""
     nodes, weights = facet_weights(mesh, sets.facets[load.set_name], order)
     which, total = _summed(nodes[weights != 0.0], weights[weights != 0.0][:, None])
     return which, load.numbers[0] * total[:, 0]
 
 
 def _summed(nodes: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Distinct nodes, ascending, and the sums of the rows (P, w) of each."""
+    """Return the distinct nodes, ascending, and the sum of the rows of each, (P, w)."""
     distinct, which = np.unique(nodes, return_inverse=True)
     columns = [np.bincount(which.ravel(), weights=column, minlength=len(distinct)) for column in values.T]
     return distinct, np.stack(columns, axis=1)

@@ -1,4 +1,4 @@
-"""Modulus mappings: from an intensity or a label to a value such as Young's modulus; in words, files, arrays."""
+"""Modulus mappings from an intensity or a label to a value such as Young's modulus, as text, files or arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tetopt.errors import InputError
 from tetopt.model.formula import parse_formula
 from tetopt.system.incoming import text_of, toml_of
 
-MAPPED_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a mapping
+MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is a mapping
 FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text may name a file
 NAMED_SUFFIXES = (".toml", ".csv")  # of that file
 
@@ -29,9 +29,9 @@ class ByLabel(NamedTuple):
     Parameters
     ----------
     values : dict of int or str to float
-        By label, or by a label's name (`tetopt.model.materials.by_label`).
+        Values by label, or by a label's name (`tetopt.model.materials.by_label`).
     rest : float, optional
-        Of all labels that are not named.
+        The value of all other labels.
 
     Examples
     --------
@@ -49,19 +49,19 @@ class ByLabel(NamedTuple):
 
 
 def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
-    """The value of each intensity by a mapping, float64 of the same shape.
+    """Apply a mapping to intensities; returns float64 values of the same shape.
 
     Parameters
     ----------
     mapping : callable, (K, 2) table or None
-        A function of a float64 array; or pairs (intensity, value), the intensities strictly increasing, between
-        which the value is linear and beyond which it keeps the last pair's; or None: the intensity itself.
+        A function of a float64 array; or pairs (intensity, value) with strictly increasing intensities, interpolated
+        linearly and constant beyond the ends; or None for the intensity itself.
     intensities : array of real numbers
 
     Raises
     ------
     InputError
-        A table that is not of that kind, or a function that returns another shape.
+        The table is invalid, or the function returns another shape.
     """
     intensities = np.asarray(intensities, dtype=np.float64)
     if mapping is None:
@@ -79,13 +79,13 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np
 
 
 def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
-    """Young's modulus of each intensity, float64 of the same shape, kPa: `mapped_values`, none of them negative.
+    """Map intensities to Young's moduli, kPa, float64 of the same shape: `mapped_values`, checked.
 
     Raises
     ------
     InputError
-        As `mapped_values`, or a modulus that is negative or not finite. A modulus of 0 is let through, as empty space
-        inside a cell; a cell of nothing else is refused when the stiffness matrix is built.
+        For the reasons of `mapped_values`; a modulus is negative or not finite. A modulus of 0 is accepted, as empty
+        space inside a cell; a cell with only such voxels is refused when the stiffness matrix is built.
 
     Examples
     --------
@@ -100,19 +100,19 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.fl
         pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
-            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} others, such as {first}; "
+            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as {first}; "
             "give a modulus mapping (`young`) that is positive over the image's range"
         )
     return young
 
 
 def parse_table(text: str) -> list[tuple[float, float]]:
-    """Pairs of intensity and modulus as written on a command line, for `young_from`.
+    """Parse pairs of intensity and modulus from a command line, for `young_from`.
 
     Raises
     ------
     InputError
-        The text is something else.
+        The text does not consist of such pairs.
 
     Examples
     --------
@@ -129,12 +129,12 @@ def parse_table(text: str) -> list[tuple[float, float]]:
 
 
 def parse_labels(text: str) -> ByLabel:
-    """Values by label, or by labels' names, as written on a command line, `*` for all others.
+    """Parse values by label or by labels' names from a command line, `*` for all others.
 
     Raises
     ------
     InputError
-        The text is something else, or names a label twice.
+        The text does not consist of such pairs, or names a label twice.
 
     Examples
     --------
@@ -153,7 +153,7 @@ def parse_labels(text: str) -> ByLabel:
 
 
 def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
-    """Values by label from pairs; ValueError for a number that is no label, InputError for a label named twice."""
+    """Convert pairs to values by label; ValueError for an invalid label, InputError for a label named twice."""
     values: dict[int | str, float] = {}
     rest: float | None = None
     for text, value in pairs:
@@ -169,7 +169,7 @@ def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
 
 
 def _label_of(text: str) -> int | str:
-    """A label, or the name of one; ValueError for no text, and for a number that is not whole."""
+    """Parse a label or the name of one; ValueError for an empty text and for a number that is not whole."""
     if not text:
         raise ValueError("a label without a name")
     try:
@@ -180,21 +180,21 @@ def _label_of(text: str) -> int | str:
 
 
 def parse_mapping(text: str) -> ModulusMapping:
-    """A mapping of the intensity from a command line, see `parse_any_mapping`.
+    """Parse a mapping of the intensity from a command line, see `parse_any_mapping`.
 
     Raises
     ------
     InputError
-        As `parse_any_mapping`, and for values by label.
+        For the reasons of `parse_any_mapping`; the text gives values by label.
     """
     mapping = parse_any_mapping(text)
     if isinstance(mapping, ByLabel):
-        raise InputError(f'mapping: expected one of the intensity, got values by label, "{text}"')
+        raise InputError(f'mapping: expected a mapping of the intensity, got values by label, "{text}"')
     return parse_formula(text) if isinstance(mapping, float) else mapping
 
 
 def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | ByLabel | float:
-    """A mapping from a command line.
+    """Parse a mapping from a command line.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     Raises
     ------
     InputError
-        As `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
+        For the reasons of `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
     """
     if (file := named_file(text)) is not None:
         return load_mapping(file, quantity)
@@ -220,23 +220,23 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
 
 
 def named_file(text: str) -> Path | None:
-    """The file that the text of one of `FILES_IN_TEXTS` names; None if the text stands for itself."""
+    """Return the file that the text of an option in `FILES_IN_TEXTS` names; None if it names no file."""
     return Path(text) if text.lower().endswith(NAMED_SUFFIXES) else None
 
 
 def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabel:
-    """A mapping from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
+    """Load a mapping from a file with two or more columns: lists in TOML, or CSV with names in the first row.
 
-    Between the columns of CSV are commas, semicolons or tabs.
+    Commas, semicolons or tabs separate the columns of CSV.
 
-    One column is "intensity", or "label" (numbers or names, "*" for all that are not there), or in its place "name",
-    and one the quantity, such as "young" (kPa) or "nu".
+    One column is "intensity", or "label" (numbers or names, "*" for all others), or "name" instead; another is the
+    quantity, such as "young" (kPa) or "nu".
 
     Raises
     ------
     InputError
-        No such file, another format, columns that are missing, of different length or not of numbers, or
-        intensities that do not increase.
+        The file does not exist or has another format; columns are missing, differ in length or are not numbers;
+        intensities do not increase.
     """
     try:
         columns = _columns(path)
@@ -250,7 +250,7 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
             )
         if len(columns[keys[0]]) != len(columns[quantity]):
             counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
-            raise InputError(f"{path}: {counts}; give one for each")
+            raise InputError(f"{path}: expected columns of the same length, got {counts}")
         values = [_number(value) for value in columns[quantity]]
         if keys != ["intensity"]:
             return _by_label([(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)])
@@ -262,7 +262,7 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
 
 
 def _number(value: Any) -> float:
-    """As float; InputError for a decimal comma, which CSV of much of the world has."""
+    """Convert to float; InputError for a decimal comma, which is common in CSV files."""
     if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+,\d+\s*", value):
         text = value.strip()
         raise InputError(f"expected numbers with a decimal point; write {text.replace(',', '.')} for {text}")
@@ -270,18 +270,18 @@ def _number(value: Any) -> float:
 
 
 def has_column(text: str, name: str) -> bool:
-    """Whether a mapping's text names a file that has such a column.
+    """Return whether a mapping's text names a file with this column.
 
     Raises
     ------
     InputError
-        As `load_mapping`, of files.
+        For the reasons of `load_mapping` on files.
     """
     if (file := named_file(text)) is None:
         return False
     try:
         return name in _columns(file)
-    except (ValueError, RecursionError):  # reported when the column that must be there is read
+    except (ValueError, RecursionError):  # reported when the required column is read
         return False
 
 
@@ -301,8 +301,8 @@ def _csv_columns(path: Path) -> dict[str, list[Any]]:
     separator = max(",;\t", key=lines[0].count) if lines else ","
     rows = [row for row in csv.reader(lines, delimiter=separator) if row]
     if not rows or any(len(row) != len(rows[0]) for row in rows):
-        comma = "" if separator != "," else "; if its decimals are commas, write 2.1 for 2,1"
-        raise InputError(f"{path}: expected a row of names and then rows of as many numbers{comma}")
+        comma = "" if separator != "," else "; if it has decimal commas, write 2.1 for 2,1"
+        raise InputError(f"{path}: expected a row of names, then rows with as many numbers{comma}")
     names = [name.strip().lower() for name in rows[0]]
     if len(set(names)) != len(names):
         raise InputError(f"{path}: expected each column once, found {', '.join(names)}")
@@ -315,19 +315,19 @@ def _checked_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]
 
 
 def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The moduli of cells, (M,); InputError unless all are above 0."""
+    """Return the moduli of cells, (M,); InputError unless all are above 0."""
     bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
     if len(bad):
         first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
         raise InputError(
-            f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
-            'give empty space a small modulus too, as `young` "0:0.1,255:6" does'
+            f"young: expected moduli above 0 kPa, got {len(bad)} invalid values, the first {first}; "
+            'give empty space a small modulus, as in `young` "0:0.1,255:6"'
         )
     return young
 
 
 def _checked_table(mapping: ArrayLike) -> NDArray[np.float64]:
-    """The (K, 2) table as float64; InputError unless finite and increasing."""
+    """Return the (K, 2) table as float64; InputError unless finite and increasing."""
     try:
         table = np.asarray(mapping, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -335,7 +335,7 @@ def _checked_table(mapping: ArrayLike) -> NDArray[np.float64]:
     if table.ndim != 2 or table.shape[1] != 2 or len(table) == 0:
         raise InputError(f"mapping: expected pairs (intensity, kPa), got an array of shape {table.shape}")
     if not np.isfinite(table).all():
-        raise InputError(f"mapping: every intensity and modulus must be finite, got {table.tolist()}")
+        raise InputError(f"mapping: expected finite intensities and moduli, got {table.tolist()}")
     falls = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
     if len(falls):
         k = int(falls[0])

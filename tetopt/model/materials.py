@@ -1,6 +1,6 @@
-"""Materials: Young's modulus and Poisson's ratio of each cell, and few materials that stand for them.
+"""Materials: Young's modulus and Poisson's ratio of each cell, and their grouping into fewer materials.
 
-Isotropic linear elasticity at the undeformed state, which is what one modulus a cell, Eq. (2), can say.
+Isotropic linear elasticity at the undeformed state, which one modulus per cell, Eq. (2), describes.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from tetopt.errors import InputError
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.mappings import ByLabel, checked_young
 
-DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells can still follow: they lock nearer to 0.5
+DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)
 
 
 class BinningError(NamedTuple):
-    """How far the modulus of the bins is from that of the cells, relative to the latter.
+    """The error of the bins' moduli, relative to the moduli of cells.
 
     Parameters
     ----------
     mean : float
-        The mean by volume.
+        The mean, weighted by volume.
     largest : float
-        The largest of all cells.
+        The maximum over all cells.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class BinningError(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """The distinct materials, softest first, and which one each cell is made of.
+    """The distinct materials, softest first, and the material of each cell.
 
     Parameters
     ----------
@@ -54,11 +54,11 @@ class Materials(NamedTuple):
     nu : (K,) float64
         Poisson's ratio.
     of_cell : (M,) int64
-        Which material each cell is made of, 0 to K - 1.
+        The material of each cell, 0 to K - 1.
     binning : BinningError, optional
-        If they stand for more moduli.
+        The error of the moduli, if they were grouped into bins.
     density : (K,) float64, optional
-        kg/m3 in every system of units.
+        kg/m3 in all systems of units.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class Materials(NamedTuple):
 
 
 def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None) -> Materials:
-    """Cells of equal modulus, ratio and density are of one material.
+    """Group cells of equal modulus, ratio and density into materials.
 
     Parameters
     ----------
@@ -90,15 +90,15 @@ def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike 
     Raises
     ------
     InputError
-        Values out of range, or not one for each cell.
+        Values are out of range, or their number is not that of the cells.
     """
     columns = [_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)]
     checked_young(columns[0])
     outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
     if len(outside):
         raise InputError(
-            f"nu: expected -1 < nu < 0.5, got {len(outside)} cells with others, the first {columns[1][outside[0]]:g} "
-            f"in cell {outside[0]}; for nearly incompressible tissue take 0.45 to 0.49"
+            f"nu: expected -1 < nu < 0.5, got others in {len(outside)} cells, the first {columns[1][outside[0]]:g} "
+            f"in cell {outside[0]}; for nearly incompressible tissue use 0.45 to 0.49"
         )
     if density is not None:
         columns.append(_checked_density(_of_cells("density", density, n_cells)))
@@ -112,22 +112,22 @@ def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
     bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
     if len(bad):
         raise InputError(
-            f"density: expected kg/m3 above 0, got {len(bad)} cells with others, the first {density[bad[0]]:g} in cell "
-            f"{bad[0]}; water's is 1000"
+            f"density: expected kg/m3 above 0, got others in {len(bad)} cells, the first {density[bad[0]]:g} in cell "
+            f"{bad[0]}; water has 1000"
         )
     return density
 
 
 def without_moduli(table: Materials) -> Materials:
-    """The materials by ratio and density alone; their moduli are 1."""
+    """Return materials by ratio and density only; their moduli are 1."""
     density = None if table.density is None else table.density[table.of_cell]
     return materials(1.0, table.nu[table.of_cell], len(table.of_cell), density)
 
 
 def density_of(table: Materials | None) -> NDArray[np.float64]:
-    """The density of each material, (K,) kg/m3; InputError if there is none, which gravity needs."""
+    """Return the density of each material, (K,) kg/m3; InputError if there is none, because gravity needs it."""
     if table is None or table.density is None:
-        raise InputError("gravity: the cells have no density; give `density`, kg/m3, such as 1000")
+        raise InputError("gravity: the cells have no density; give `density` in kg/m3, such as 1000")
     return table.density
 
 
@@ -141,7 +141,7 @@ def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]
 
 
 def cells_of(table: Materials) -> list[NDArray[np.int64]]:
-    """The cells of each material, ascending."""
+    """Return the cells of each material, ascending."""
     ends = np.cumsum(np.bincount(table.of_cell, minlength=len(table.young)))
     return np.split(np.argsort(table.of_cell, kind="stable"), ends[:-1])
 
@@ -149,19 +149,19 @@ def cells_of(table: Materials) -> list[NDArray[np.int64]]:
 def by_label(
     mapping: ByLabel, labels: NDArray[np.integer] | None, names: Mapping[int, str] | None = None
 ) -> NDArray[np.float64]:
-    """The value that each cell's label has, (M,) float64.
+    """Return the value of each cell by its label, (M,) float64.
 
     Parameters
     ----------
     mapping : ByLabel
-        A name in it is that of all labels that are called so (`tetopt.model.labels.labels_named`).
+        A name in it refers to all labels with that name (`tetopt.model.labels.labels_named`).
     labels : (M,) integers or None
     names : mapping of label to text, optional
 
     Raises
     ------
     InputError
-        No labels, one that has no value or two, or a name that no label has.
+        There are no labels; a label has no value or two; no label has a given name.
     """
     if labels is None:
         raise InputError("values by label: the mesh has no labels; give the label image (`labels`)")
@@ -170,37 +170,37 @@ def by_label(
     for key, value in mapping.values.items():
         for label in [key] if isinstance(key, int) else labels_named(key, names):
             if label in values:
-                raise InputError(f"values by label: label {label_words(label, names)} has two values; give each once")
+                raise InputError(f"values by label: label {label_words(label, names)} has two values; give only one")
             values[label] = value
     kinds, which = np.unique(labels, return_inverse=True)
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
     if missing and mapping.rest is None:
         raise InputError(
-            f"values by label: given for {', '.join(map(str, mapping.values))}, the mesh also has {', '.join(missing)} "
-            f"({len(missing)} more); give these, too, or all of them as *=VALUE"
+            f"values by label: got {', '.join(map(str, mapping.values))}, the mesh also has {', '.join(missing)} "
+            f"({len(missing)} more); give values for these, or *=VALUE for all others"
         )
     return np.array([values.get(label, mapping.rest) for label in kinds.tolist()], dtype=np.float64)[which.ravel()]
 
 
 def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
-    """At most `count` moduli instead of all.
+    """Group moduli into at most `count` bins.
 
-    The modulus of a bin is the mean by volume of its cells'. Ratios, and densities, are kept as they are while there
-    are at most `count` of them, else put into bins in the same way; a material is one bin of each.
+    The modulus of a bin is the mean over its cells, weighted by volume. Ratios and densities are unchanged if there are
+    at most `count` of them; otherwise they are binned in the same way. A material is a combination of bins.
 
     Parameters
     ----------
     exact : Materials
     volumes : (M,) float64
-        Of the cells.
+        Volumes of the cells.
     count : int
     spacing : {"equal", "quantile", "log"}
-        Bins of equal width; with equally many cells; of equal width of the logarithm.
+        Bins of equal width; with equal numbers of cells; of equal width in the logarithm.
 
     Raises
     ------
     InputError
-        No bins, or another word.
+        `count` is below 1, or `spacing` is unknown.
     """
     if count < 1:
         raise InputError(f"bins: expected 1 or more, got {count}")
@@ -219,7 +219,7 @@ def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: 
 def _bin_means(
     values: NDArray[np.float64], volumes: NDArray[np.float64], count: int, spacing: Spacing
 ) -> NDArray[np.float64]:
-    """Each value replaced by the mean of its bin; up to `count` distinct values are left as they are."""
+    """Replace each value by the mean of its bin; up to `count` distinct values are unchanged."""
     if len(np.unique(values)) <= count:
         return values
     scaled = np.log(values) if spacing == "log" else values
@@ -230,7 +230,7 @@ def _bin_means(
     which = np.searchsorted(inner, scaled, side="right")
     sizes = np.bincount(which, weights=volumes, minlength=count)
     total = np.bincount(which, weights=volumes * values, minlength=count)
-    # Rounding may take a mean out of its bin by a bit where all of its values are equal.
+    # Rounding may move a mean slightly out of its bin where all values are equal.
     low, high = ranges_of(which, values, count)
     with np.errstate(invalid="ignore"):  # bins without cells
         return np.clip(total / sizes, low, high)[which]

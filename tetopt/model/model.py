@@ -1,4 +1,4 @@
-"""The model: a mesh with all that a solver is told of it."""
+"""The model: a mesh with everything that a solver needs."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 class Units(NamedTuple):
-    """What is consistent with mm, s and a unit of stress."""
+    """Units consistent with mm, s and a unit of stress."""
 
-    kPa: float  # in one of the unit of stress
+    kPa: float  # per unit of stress
     force: str
     energy: str
     mass: str
@@ -44,48 +44,48 @@ class Units(NamedTuple):
 
 STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
 WATER_DENSITY = 1000.0  # kg/m3
-# What is a thousand times off from any tissue is most likely in another unit. Soft tissue is from 0.1 to some hundred
-# kPa; as Pa all of it lies between the first two, where hardly anything but cartilage does, and as MPa below the third.
+# Values a thousand times off from any tissue are most likely in another unit. Soft tissue has 0.1 to a few hundred kPa:
+# in Pa it lies within the first range, where otherwise only cartilage does, and in MPa it lies below the third number.
 PASCAL_RANGE = (1e3, 1e5)
 MEGAPASCAL_MOST = 0.05
-GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has so many g/cm3, and nothing but gases so few kg/m3
-METRE_GRAVITY = (1.0, 100.0)  # mm/s2: the moon's to ten times the earth's in m/s2, of which 9.81 are 9810 mm/s2
-LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/understand/order.md
+GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has about this many g/cm3, and only gases have so few kg/m3
+METRE_GRAVITY = (1.0, 100.0)  # mm/s2: from the moon's to ten times the earth's gravity if taken as m/s2
+LOCKING_NU = 0.45  # above this, linear cells are far worse than quadratic ones, see docs/understand/order.md
 SPACES = ("ras", "lps")  # conventions of the world's axes
-ON_PREFIX, IN_PREFIX = "on_", "in_"  # of data that are 1 on the nodes of a set of facets, in the cells of a set
+ON_PREFIX, IN_PREFIX = "on_", "in_"  # prefixes of data that are 1 on the nodes of a facet set, in the cells of a set
 
 
 class Model(NamedTuple):
-    """What is written for a solver. Lengths in mm; moduli in `units`.
+    """A mesh with everything that is written for a solver. Lengths in mm; moduli in `units`.
 
     Parameters
     ----------
     mesh : Mesh
         Points in mm, in the axes of `space`.
     cell_data : dict of arrays
-        By name, one row a cell.
+        By name, one row per cell.
     sets : Sets
-        Of facets and cells, by name.
+        Sets of facets and cells, by name.
     materials : Materials, optional
-        The distinct ones, and which each cell is made of.
+        The distinct materials, and the material of each cell.
     loads : tuple of Load
         Supports, displacements, pressures, tractions, springs, gravity.
     order : {1, 2}
-        2: quadratic cells, of straight edges unless the mesh has midpoints, see `tetopt.geometry.quadratic`.
+        2: quadratic cells, with straight edges unless the mesh has midpoints, see `tetopt.geometry.quadratic`.
     units : {"kPa", "MPa"}
-        Of moduli and pressures.
+        Unit of moduli and pressures.
     space : {"ras", "lps"}
-        "lps": x and y have changed sign.
+        "lps": the signs of x and y are reversed.
     node_young : (N,) float64, optional
         A modulus at each corner, linear within cells, instead of those of the materials.
     gauss_young : (M, Q) float64, optional
-        One at each Gauss point of the order, for `tetopt.fem`.
+        A modulus at each Gauss point of the order, for `tetopt.fem`.
     is_nonlinear : bool
-        Whether steps ask for large deformation.
+        True if steps are solved with large deformation.
     about : dict
-        By name a text, or what JSON can hold, for the file's head.
+        Texts, or values in JSON's types, by name, for the file's header.
     point_data : dict of arrays
-        By name, a row a mesh point, or a node of order 2.
+        By name, one row per mesh point, or per node of order 2.
 
     Examples
     --------
@@ -108,11 +108,11 @@ class Model(NamedTuple):
     node_young: NDArray[np.float64] | None = None
     gauss_young: NDArray[np.float64] | None = None
     is_nonlinear: bool = False
-    about: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
+    about: dict[str, Any] = {}  # noqa: RUF012 - never changed
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
 
     def _repr_html_(self) -> str:
-        """What the model holds, with the middle section by mean or modulus, for a notebook."""
+        """Show the model in a notebook, with the middle section shaded by mean or modulus."""
         mesh, table = self.mesh, self.materials
         rows = notebook.mesh_rows(mesh.points, mesh.cells)
         rows += [("order", str(self.order)), ("sets of facets", ", ".join(self.sets.facets) or "none")]
@@ -126,17 +126,17 @@ class Model(NamedTuple):
         return notebook.card_html("Model", rows, notebook.section_html(mesh.points, mesh.cells, values))
 
     def to_skfem(self) -> skfem.Mesh:
-        """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.skfem_mesh`.
+        """Convert the mesh and its sets for scikit-fem; see `tetopt.model.skfem.skfem_mesh`.
 
         Returns
         -------
         skfem.MeshTri or skfem.MeshTet
-            Facet sets are its boundaries, cell sets its subdomains.
+            Facet sets become its boundaries, cell sets its subdomains.
 
         Raises
         ------
         InputError
-            The model is quadratic: elements of any order are chosen in scikit-fem; or scikit-fem is not installed.
+            The model is quadratic (choose the order of elements in scikit-fem), or scikit-fem is not installed.
 
         Examples
         --------
@@ -150,19 +150,19 @@ class Model(NamedTuple):
         """
         if self.order != 1:
             raise InputError(
-                "to_skfem: expected linear cells, got order 2; leave out the order and take P2 elements in scikit-fem"
+                "to_skfem: expected linear cells, got order 2; omit the order and use P2 elements in scikit-fem"
             )
         return skfem_mesh(self.mesh, self.sets)
 
     def to_pyvista(self) -> pyvista.UnstructuredGrid:
-        """The mesh for pyvista, with all that is on its cells and nodes.
+        """Convert the mesh for pyvista, with all data of its cells and nodes.
 
         Returns
         -------
         pyvista.UnstructuredGrid
-            Of cells of the model's order. Its data are `cell_data` and `point_data`, of the materials "young", in
-            `units`, "nu", "material" (from 1) and "density" (kg/m3), and of each set "in_NAME" (1 in its cells), or
-            "on_NAME" (1 on its nodes).
+            Cells of the model's order with `cell_data` and `point_data`; for materials "young", in `units`, "nu",
+            "material" (from 1) and "density" (kg/m3); and for each set "in_NAME" (1 in its cells) or "on_NAME" (1 on
+            its nodes).
 
         Examples
         --------
@@ -177,13 +177,13 @@ class Model(NamedTuple):
         return conversions.to_pyvista(*elements(self), VTK_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes)
 
     def to_meshio(self) -> meshio.Mesh:
-        """The mesh for meshio, with all that is on its cells and nodes.
+        """Convert the mesh for meshio, with all data of its cells and nodes.
 
         Returns
         -------
         meshio.Mesh
-            One block of cells of the model's order, with data as `to_pyvista` has them; sets of cells are `cell_sets`,
-            the nodes of sets of facets `point_sets`.
+            One block of cells of the model's order, with the same data as `to_pyvista`; sets of cells become
+            `cell_sets`, the nodes of sets of facets `point_sets`.
 
         Examples
         --------
@@ -201,19 +201,19 @@ class Model(NamedTuple):
 
 
 def in_space(model: Model, space: str) -> Model:
-    """The model in another convention of world axes: "ras" (NIfTI) or "lps" (DICOM, ITK), a half turn about z.
+    """Convert the model to the world axes "ras" (NIfTI) or "lps" (DICOM, ITK), by a half turn about z.
 
     Raises
     ------
     InputError
-        Another word, or a 2-D model, whose plane may be any.
+        The space is unknown, or the model is 2-D, in an arbitrary plane.
     """
     if space not in SPACES:
         raise InputError(f"space: expected ras or lps, got {space}")
     if space == model.space:
         return model
     if model.mesh.ndim == 2:
-        raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out `space`")
+        raise InputError("space: a triangle mesh has coordinates in its own plane; omit `space`")
     loads = tuple(half_turned(load) for load in model.loads)
     middles = None if model.mesh.midpoints is None else half_turn(model.mesh.midpoints)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells, middles)
@@ -222,22 +222,22 @@ def in_space(model: Model, space: str) -> Model:
 
 
 def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors (..., 3) turned about z: from RAS+ to LPS+ or back."""
+    """Turn vectors (..., 3) about z, from RAS+ to LPS+ or back."""
     return vectors * HALF_TURN + 0.0  # + 0.0: no -0
 
 
 def half_turned(load: Load) -> Load:
-    """A load from RAS+ to LPS+ or back."""
+    """Convert a load from RAS+ to LPS+ or back."""
     return load._replace(numbers=half_turn(load.numbers)) if len(load.numbers) == 3 else load
 
 
 def in_units(model: Model, units: str) -> Model:
-    """The model with its moduli, pressures, tractions and springs in another unit of stress, kPa or MPa.
+    """Convert moduli, pressures, tractions and springs to another unit of stress, kPa or MPa.
 
     Raises
     ------
     InputError
-        Another word.
+        The unit is unknown.
     """
     if units not in STRESS_UNITS:
         raise InputError(f"units: expected {' or '.join(STRESS_UNITS)}, got {units}")
@@ -257,39 +257,34 @@ def in_units(model: Model, units: str) -> Model:
 
 
 def scaled(load: Load, factor: float) -> Load:
-    """A load in a unit of stress of which there are `factor` in the present one."""
+    """Convert a load to a unit of stress; `factor` is the number of new units per present unit."""
     return load._replace(numbers=load.numbers * factor) if load.kind in FACET_FORCES else load
 
 
 def odd_units(model: Model) -> Iterator[str]:
-    """What of a model, in kPa, seems to be in another unit than it should be, a line each."""
+    """Yield a line for each quantity of a model in kPa that seems to be in a wrong unit."""
     if (table := model.materials) is not None:
         low, high = float(table.young.min()), float(table.young.max())
         if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
             yield (
-                f"young is from {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to some hundred kPa): if it "
-                "was meant in Pa, divide it by 1000"
+                f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few hundred kPa): if it "
+                "is in Pa, divide it by 1000"
             )
         elif high < MEGAPASCAL_MOST:
             yield (
-                f"young is up to {high:.4g} kPa, softer than any tissue (0.1 kPa and more): if it was meant in MPa, "
-                "multiply it by 1000; `units` is of the file alone"
+                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if it is in MPa, "
+                "multiply it by 1000; `units` affects only the output file"
             )
         if table.density is not None and (densest := float(table.density.max())) < GRAM_DENSITY_MOST:
-            yield (
-                f"density is up to {densest:.4g} kg/m3, where water's is 1000: if it was meant in g/cm3, multiply it "
-                "by 1000"
-            )
+            yield f"density is at most {densest:.4g} kg/m3, water has 1000: if it is in g/cm3, multiply it by 1000"
     for load in model.loads:
         size = float(np.sqrt((load.numbers**2).sum()))
         if load.kind == "gravity" and METRE_GRAVITY[0] <= size <= METRE_GRAVITY[1]:
-            yield (
-                f"gravity is {size:.4g} mm/s2, where the earth's is 9810: if it was meant in m/s2, multiply it by 1000"
-            )
+            yield f"gravity is {size:.4g} mm/s2, the earth's is 9810: if it is in m/s2, multiply it by 1000"
 
 
 def locking_words(model: Model) -> str:
-    """A warning of linear cells that are too stiff for the ratios, nothing if they are not."""
+    """Return a warning if linear cells are too stiff for the Poisson's ratios, else an empty text."""
     largest = 0.0 if model.materials is None else float(model.materials.nu.max())
     if model.order != 1 or largest < LOCKING_NU:
         return ""
@@ -300,7 +295,7 @@ def locking_words(model: Model) -> str:
 
 
 def described(model: Model) -> list[str]:
-    """Lines for a file's head: who wrote it, in what coordinates and units, and from what."""
+    """Return lines for a file's header: the writer, coordinates, units and inputs."""
     units = STRESS_UNITS[model.units]
     lines = [
         f"tetopt {model.about.get('tetopt', '')}".strip(),
@@ -311,26 +306,26 @@ def described(model: Model) -> list[str]:
         lines.append(f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}")
     if model.materials is not None and (error := model.materials.binning) is not None:
         lines.append(
-            f"materials: bins, modulus off by {error.mean:.3%} in the mean by volume, {error.largest:.3%} at most"
+            f"materials: bins, error of the modulus {error.mean:.3%} (mean by volume), {error.largest:.3%} (largest)"
         )
-    # A line break in a file's name would end a comment.
+    # A line break in a file's name would end the comment.
     return [" ".join(line.split()) for line in lines]
 
 
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
+    """Return points and cells of the model's order: the mesh's own, or those of `quadratic`."""
     return of_order(model.mesh.points, model.mesh.cells, model.order, model.mesh.midpoints)
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:
-    """The density of each material, (K,), in the model's units of mass by mm3; water's if none is stated."""
+    """Return the density of each material, (K,), in the model's unit of mass per mm3; water's if there is none."""
     assert model.materials is not None
     density, water = model.materials.density, STRESS_UNITS[model.units].water
     return np.full(len(model.materials.young), water) if density is None else density / WATER_DENSITY * water
 
 
 def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
-    """What is on each cell, and on each node of the model's order: its data, sets of facets, and materials."""
+    """Return the fields of cells and of nodes of the model's order: data, sets of facets, and materials."""
     on_cells = dict(model.cell_data)
     on_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
     points, cells = elements(model)
@@ -350,5 +345,5 @@ def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
 
 
 def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes of the facets (K, 2) of cells of either order: `facet_triples` or `quadratic_facet_nodes`."""
+    """Return the nodes of facets (K, 2) for either order: `facet_triples` or `quadratic_facet_nodes`."""
     return (quadratic_facet_nodes if cells.shape[1] in (6, 10) else facet_triples)(cells, rows)

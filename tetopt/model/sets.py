@@ -1,7 +1,7 @@
-"""Named sets of facets and cells, which boundary conditions and materials are given to.
+"""Named sets of facets and cells for boundary conditions and materials.
 
-A facet is a row (cell, k): the facet of that cell opposite its local node k, so that its outer side is known, and with
-it which side of an interface is meant. Nodes need no sets of their own: those of a facet set are `nodes_of` it.
+A facet is a row (cell, k): the facet of that cell opposite its local node k. This defines its outer side, and thus the
+side of an interface. There are no sets of nodes: `nodes_of` gives the nodes of a facet set.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from tetopt.geometry.topology import facets, largest_component
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
-BOUNDARY_SET = "boundary"  # every facet of one cell only
-MASK_SURFACE_SET = "mask_surface"  # those of them off the faces of the image's box
-SIDE_DEPTH = 0.1  # of a mesh's extent: a side that is off the box is the outermost tenth (a tenth of a ball's surface)
-# By RAS+: the side of smaller and of larger world coordinate. A slice's two axes may be any of the three.
+BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
+MASK_SURFACE_SET = "mask_surface"  # boundary facets that are not on the faces of the image's box
+SIDE_DEPTH = 0.1  # fraction of the extent: a side off the box is the outermost tenth (a tenth of a ball's surface)
+# In RAS+: the sides of smaller and of larger world coordinate. The two axes of a slice may be any of the three.
 FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     2: (("x_min", "x_max"), ("y_min", "y_max")),
     3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
 }
-MOST_LETTERS = 72  # of a name: room for an interface of two long ones; Abaqus and CalculiX take 80
-SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")  # what every format can carry
-# What labels' names are not to be taken for: other labels, interfaces, and what formats call their own.
+MOST_LETTERS = 72  # in a name: enough for an interface of two long names; Abaqus and CalculiX allow 80
+SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")  # names that all formats support
+# Names that labels must not have: those of other labels, interfaces, and names that formats use themselves.
 RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cells", re.IGNORECASE)
 
 
 class Sets(NamedTuple):
-    """Sets by name; all names differ, and by more than case, as some formats have one list of names for everything.
+    """Sets by name; all names differ by more than case, because some formats have one list of names for everything.
 
     Parameters
     ----------
@@ -85,20 +85,20 @@ class Box(NamedTuple):
 
 
 def standard_names(ndim: int) -> set[str]:
-    """The names of the sets on the boundary of every mesh."""
+    """Return the names of the standard sets on the boundary."""
     return {BOUNDARY_SET, MASK_SURFACE_SET, *(name for pair in FACE_NAMES[ndim] for name in pair)}
 
 
 def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes of the facets (K, 2), (K, n) int64, turned to face out of their cell.
+    """Return the nodes of facets (K, 2), (K, n) int64, oriented outwards from their cell.
 
-    In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points out; in 2-D the right side of a -> b lies outside.
+    In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points outwards; in 2-D the right side of a -> b is outside.
     """
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
 
 
 def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Outward normals of facets (K, 2), as long as each is large, (K, n), mm2 (in 2-D mm)."""
+    """Return the outward area vectors of facets (K, 2), (K, n), mm2 (in 2-D mm)."""
     corners = mesh.points[facet_triples(mesh.cells, rows)]
     edges = corners[:, 1:] - corners[:, :1]
     if mesh.ndim == 3:
@@ -107,12 +107,12 @@ def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The nodes of a facet set, (P,) int64, ascending."""
+    """Return the nodes of a facet set, (P,) int64, ascending."""
     return np.unique(facet_triples(mesh.cells, rows))
 
 
 def boundary_rows(mesh: Mesh) -> NDArray[np.int64]:
-    """Every facet that belongs to one cell only, (B, 2) int64, ascending."""
+    """Return all facets that belong to only one cell, (B, 2) int64, ascending."""
     shared = facets(mesh.cells)
     return np.argwhere(shared.n_cells[shared.of_cell] == 1)
 
@@ -124,34 +124,34 @@ def standard_sets(
     names: Mapping[int, str] | None = None,
     own: Mapping[str, NDArray[np.int64]] | None = None,
 ) -> Sets:
-    """The sets that every mesh comes with.
+    """Return the standard sets of a mesh.
 
     Parameters
     ----------
     mesh : Mesh
     box : Box, optional
-        The box of the image that the mesh was made from, whose faces are named by the world axis that each is nearest
-        to: "left" is the side of smaller x in RAS+. By default the box along the world's axes around the mesh.
+        The box of the meshed image; each face is named after the nearest world axis: "left" is the side of smaller x in
+        RAS+. By default the axis-aligned bounding box of the mesh.
     labels : (M,) integers, optional
         Label of each cell.
     names : mapping of label to text, optional
-        What labels are called.
+        Names of labels.
     own : mapping of (K, 2) int64, optional
-        Sets of facets that the mesh brings along; they replace sides by its own extent.
+        The mesh's own sets of facets; they replace sides defined by the extent of the mesh.
 
     Returns
     -------
     Sets
         Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D "x_min", "x_max",
         "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off its faces; sets without facets are
-        left out. A side is the boundary on that face of the box; where there is none, as on an organ within the box,
-        the facets of the outermost tenth of the mesh along the world axis that face that way more than any other.
-        With labels also those of `label_sets`.
+        omitted. A side is the boundary on that face of the box; if there is none, as on an organ within the box, it is
+        the set of facets in the outermost tenth of the mesh along the world axis that mainly face in this direction.
+        With labels, the result includes `label_sets`.
 
     Raises
     ------
     InputError
-        Labels that are not one whole number from 0 for each cell.
+        Labels are not one whole number from 0 for each cell.
     """
     boundary = boundary_rows(mesh)
     faces = face_sets(mesh, boundary, box)
@@ -164,15 +164,15 @@ def standard_sets(
 
 
 def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str] | None = None) -> Sets:
-    """Cells of each label, and facets between each two, as rows of the cells with the smaller one.
+    """Return the cells of each label, and the facets between two labels, as rows of cells with the smaller label.
 
-    They are called "label_1", ..., "interface_1_2", ..., with a name for a number where a label has one: see
-    `label_set_names` and `interface_names`.
+    They are named "label_1", ..., "interface_1_2", ..., or after the names of labels: see `label_set_names` and
+    `interface_names`.
 
     Raises
     ------
     InputError
-        Labels that are not one whole number from 0 for each cell.
+        Labels are not one whole number from 0 for each cell.
     """
     labels = _checked_labels(labels, mesh)
     of_label = label_set_names(np.unique(labels).tolist(), names or {})
@@ -185,10 +185,10 @@ def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str]
 
 
 def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int, str]:
-    """What the set of each label's cells is called: its name, as far as every format can carry it, or "label_5".
+    """Return the name of each label's set of cells: the label's name in letters that all formats support, or "label_5".
 
-    All names differ by more than case, and do not depend on which of the labels of `names` are there: where two would
-    be the same, or one is another set's, the label's number follows each.
+    All names differ by more than case and do not depend on which labels of `names` are present: if two would be equal,
+    or one is the name of another set, the label's number is appended.
 
     Examples
     --------
@@ -211,17 +211,17 @@ def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int
 
 
 def _plain_name(name: str) -> str:
-    """The name in letters that every format can carry; nothing if none of it is left."""
+    """Reduce a name to letters that all formats support; may be empty."""
     letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     joined = re.sub(r"[^A-Za-z0-9-]+", "_", letters).strip("_-")
     return (joined if joined[:1].isalpha() or not joined else f"label_{joined}")[:MOST_LETTERS]
 
 
 def interface_names(pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str]) -> dict[tuple[int, int], str]:
-    """What the facets between each two labels are called: "interface_liver_spleen", by numbers "interface_1_5".
+    """Return the names of interfaces between labels: "interface_liver_spleen", or by number "interface_1_5".
 
-    `of_label` is as of `label_set_names`. Numbers stand where a label has no name, and where the names are too long
-    together or would be the same for two pairs.
+    `of_label` is the result of `label_set_names`. Numbers are used for a label without a name, and if the names are too
+    long together or the same for two pairs.
     """
     parts = {label: str(label) if name == f"label_{label}" else name for label, name in of_label.items()}
     named = {(a, b): f"interface_{parts[a]}_{parts[b]}" for a, b in pairs}
@@ -233,7 +233,7 @@ def interface_names(pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str
 
 
 def face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
-    """The boundary's facets on each face of the box, and, with a box, those on none of them."""
+    """Return the boundary facets on each face of the box, and, with a box, those on no face."""
     n = mesh.ndim
     if box is None:
         low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
@@ -255,9 +255,9 @@ def face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[
 
 
 def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """The boundary's facets in the outermost tenth of the mesh along each world axis, of those that face that way.
+    """Return the boundary facets in the outermost tenth of the mesh along each world axis that face this direction.
 
-    No facet is on two sides: each faces the side that its normal is nearest to.
+    No facet belongs to two sides: each faces the direction nearest to its normal.
     """
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     centres = mesh.points[facet_triples(mesh.cells, boundary)].mean(axis=1)
@@ -272,7 +272,7 @@ def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[n
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Facets between each two labels, the smaller first, as rows of its cells."""
+    """Return the facets between each pair of labels, as rows of cells with the smaller one, which comes first."""
     shared = facets(mesh.cells)
     of_cell = shared.cells[shared.of_cell]  # (M, n+1, 2)
     own = np.arange(len(mesh.cells))[:, None]
@@ -298,27 +298,27 @@ def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     return whole
 
 
-# Sets that a user asks for
+# Sets requested by the user
 
 
 def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArray[np.float64] | None) -> Sets:
-    """`sets` and those that are requested in words.
+    """Add requested sets to `sets`.
 
     Parameters
     ----------
     mesh : Mesh
     sets : Sets
     requests : iterable of str
-        "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), with
+        "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), and
         the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets
-        all of whose nodes lie within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
+        with all nodes within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
     mean : (M,) float64, optional
         Mean intensity of each cell.
 
     Raises
     ------
     InputError
-        Other words, a name that is taken or that a format cannot carry, no means, or a set without members.
+        A request is invalid; its name is in use or not supported by all formats; the mesh has no means; a set is empty.
     """
     for text in requests:
         request = parse_set(text, mesh.ndim)
@@ -333,24 +333,24 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArra
 
 
 class SetRequest(NamedTuple):
-    """A set that a user asks for."""
+    """A set requested by the user."""
 
     name: str
     kind: str
     vectors: list[NDArray[np.float64]]  # the numbers between the colons
 
     def names(self) -> tuple[str, ...]:
-        """The names that it takes."""
+        """Return the names of the sets that it creates."""
         return (self.name, f"{self.name}_surface") if self.kind == "below" else (self.name,)
 
 
 def parse_set(text: str, ndim: int) -> SetRequest:
-    """A set from words, see `with_requested`.
+    """Parse a requested set, see `with_requested`.
 
     Raises
     ------
     InputError
-        Other words, other numbers, or a name that a format cannot carry.
+        Invalid words or numbers, or a name that is not supported by all formats.
     """
     name, equals, what = text.partition("=")
     kind, _, rest = what.partition(":")
@@ -359,7 +359,7 @@ def parse_set(text: str, ndim: int) -> SetRequest:
         raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
     if not SET_NAME.fullmatch(name):
         raise InputError(
-            f'set: a name is a letter, then up to {MOST_LETTERS - 1} letters, digits, _ and -, got "{name}"'
+            f'set: expected a name of a letter and up to {MOST_LETTERS - 1} letters, digits, _ and -, got "{name}"'
         )
     form, counts = shapes[kind]
     parts = rest.split(":")
@@ -369,49 +369,49 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     if kind != "below" and vectors[-1][0] < 0.0:
         raise InputError(f"set {name}: expected a distance of 0 or more, got {vectors[-1][0]:g}")
     if kind == "plane" and not vectors[1].any():
-        raise InputError(f"set {name}: the plane's normal must not be 0")
+        raise InputError(f"set {name}: expected a normal other than 0, got 0")
     return SetRequest(name, kind, vectors)
 
 
 def enclosing_facets(mesh: Mesh, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The facets between some cells and all else, as rows of those cells, (K, 2) int64."""
+    """Return the facets that enclose some cells, as rows of these cells, (K, 2) int64."""
     part = Mesh(mesh.points, mesh.cells[cells])
     rows = boundary_rows(part)
     return np.column_stack([cells[rows[:, 0]], rows[:, 1]])
 
 
 def check_free_names(request: SetRequest, sets: Sets) -> None:
-    """InputError if a set that is requested takes a name that there is."""
+    """Raise InputError if a requested set has a name that is in use."""
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
     for name in request.names():
         if name.lower() in taken:
-            raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
+            raise InputError(f'set: a set "{taken[name.lower()]}" exists already; choose another name than "{name}"')
 
 
 def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
     name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
-        raise InputError(f"set {name}: the mesh has no means; give the image they come from (`image`)")
+        raise InputError(f"set {name}: the mesh has no cell means; give the image (`image`)")
     chosen = largest_component(mesh.cells, mean < threshold)
     if len(chosen) == 0:
-        raise InputError(f"set {name}: no cell has a mean below {threshold:g}, they go from {mean.min():g} up")
+        raise InputError(f"set {name}: no cell has a mean below {threshold:g}, the lowest is {mean.min():g}")
     return chosen
 
 
 def _facets_within(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
-    """Boundary facets all of whose nodes lie within the distance of the point or plane."""
+    """Return the boundary facets with all nodes within the distance of the point or plane."""
     offset = mesh.points - request.vectors[0]
     if request.kind == "point":
         distance = np.sqrt((offset**2).sum(axis=1))
     else:
-        normal = request.vectors[1] / np.abs(request.vectors[1]).max()  # whose square neither overflows nor vanishes
+        normal = request.vectors[1] / np.abs(request.vectors[1]).max()  # its square neither overflows nor vanishes
         distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
     reach = float(request.vectors[-1][0])
     rows = boundary_rows(mesh)
     farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {request.name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
+            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one lies within "
             f"{farthest.min():.4g} mm"
         )
     return rows[farthest <= reach]
@@ -425,7 +425,7 @@ def _numbers(name: str, text: str, count: int) -> NDArray[np.float64]:
 
 
 def finite_numbers(text: str) -> NDArray[np.float64]:
-    """The numbers between commas, float64; none if there is anything else, or one that is not finite."""
+    """Parse comma-separated numbers, float64; empty for any other text, or if one is not finite."""
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -437,9 +437,9 @@ def finite_numbers(text: str) -> NDArray[np.float64]:
 
 
 def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (cell, k), ascending, of facets given by their nodes (K, n); what is no facet is left out.
+    """Return the rows (cell, k), ascending, of facets given by their nodes (K, n); others are ignored.
 
-    A facet between two cells is held by the one that its nodes, as those of `facet_triples`, face out of.
+    A facet between two cells belongs to the one from which its nodes, oriented as in `facet_triples`, point outwards.
     """
     shared = facets(mesh.cells)
     distinct, which = np.unique(np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
@@ -453,17 +453,17 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
     first, second = shared.cells[number].T
     rows = held_by(first)
-    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # which face the same way
+    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # the same orientation
     faces_out = np.any([(facet_triples(mesh.cells, rows) == each).all(axis=1) for each in rolled], axis=0)
     rows = np.where((faces_out | (second < 0))[:, None], rows, held_by(second))
     return rows[np.lexsort(rows.T[::-1])]
 
 
 def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
-    """Those facet sets of the mesh `before` of which `mesh` still has every facet, as its own rows.
+    """Return the facet sets of the mesh `before` whose facets all exist in `mesh`, as rows of `mesh`.
 
-    Facets are the same if their nodes lie in the same places. Where an optimisation kept the boundary, these are the
-    sets on the boundary. Cell sets do not survive, since the cells are others.
+    Facets are the same if their nodes have the same positions. If an optimisation kept the boundary, these are the sets
+    on the boundary. Cell sets do not survive, because the cells change.
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])
@@ -472,7 +472,7 @@ def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
 
 
 def free_name(label: str, taken: set[str]) -> str:
-    """A name like `label` that every format can carry and that differs from those taken by more than case."""
+    """Return a name like `label` that all formats support and that differs from those taken by more than case."""
     name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
     stem = (name if name[0].isalpha() else f"set_{name}")[:MOST_LETTERS]
     name, number = stem, 1
@@ -483,9 +483,9 @@ def free_name(label: str, taken: set[str]) -> str:
 
 
 def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
-    """The standard sets and a mesh's own; and the new names of those of its own whose names were taken.
+    """Merge the standard sets with a mesh's own; return also the new names of own sets whose names were in use.
 
-    A set of its own that is the same as the standard one of its name is that one.
+    An own set that equals the standard set of the same name is merged with it.
     """
     parts: tuple[dict[str, NDArray[np.int64]], ...] = (dict(standard.facets), dict(standard.cells))
     renamed = {}
@@ -501,10 +501,10 @@ def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
 
 
 def box_text(box: Box) -> dict[str, Any]:
-    """What `tetopt.io.vtk.box_in` reads, for a mesh's `about`."""
+    """Return the text for a mesh's `about` that `tetopt.io.vtk.box_in` reads."""
     return {"shape": list(box.shape), "affine": box.affine.tolist()}
 
 
 def box_of(image: Image) -> Box:
-    """The box that an image fills."""
+    """Return the box that an image fills."""
     return Box(image.shape, image.affine)

@@ -1,4 +1,4 @@
-"""Meshes with their sets in scikit-fem, without a file."""
+"""Conversion of meshes with their sets to scikit-fem, without a file."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
-    """A mesh with its sets, as scikit-fem has them.
+    """Convert a mesh with its sets to scikit-fem.
 
-    Nodes and cells keep their order, so that what is on each cell stays as it is, such as `young[of_cell]` of the
-    materials; scikit-fem sorts the three nodes of a triangle, though. Facet sets are `boundaries`, those with facets
-    between two cells as `OrientedBoundary`, whose normals point out of the cells that the set holds them by; cell sets
-    are `subdomains`. A 2-D mesh is a `MeshTri`, a 3-D one a `MeshTet`.
+    Nodes and cells keep their order, so that cell data, such as `young[of_cell]` of the materials, remain valid;
+    scikit-fem sorts the three nodes of a triangle, though. Facet sets become `boundaries`; those with facets between
+    two cells become an `OrientedBoundary`, whose normals point out of the cells in the set. Cell sets become
+    `subdomains`. A 2-D mesh becomes a `MeshTri`, a 3-D one a `MeshTet`.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
 
 
 def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:
-    """scikit-fem's numbers of the facets (K, 2)."""
+    """Return scikit-fem's numbers of the facets (K, 2)."""
     from skfem.generic_utils import OrientedBoundary
 
     cell, node = rows[:, 0], cells[rows[:, 0], rows[:, 1]]

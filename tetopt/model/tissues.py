@@ -1,4 +1,4 @@
-"""Labels merged into tissues: by groups in words, of a file or of a program that is known, or by names they share."""
+"""Merging of labels into tissues: by groups in text, in a file or of a known program, or by shared names."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tetopt.model.labels import labels_named
 from tetopt.model.mappings import named_file
 from tetopt.system.incoming import rows_of, toml_of
 
-REST = "*"  # all labels that no group names, but 0
-UNGROUPED_LISTED = 20  # labels in a message
+REST = "*"  # all labels in no other group, except 0
+UNGROUPED_LISTED = 20  # labels listed in a message
 GROUP = re.compile(r"\s*(?:(\d{1,9})\s*:)?\s*([^=:;*]*[^=:;*\s])\s*=([^=;]*)")
 RANGE = re.compile(r"(\d{1,9})(?:\s*-\s*(\d{1,9}))?")
 
 
 class LabelGroup(NamedTuple):
-    """Labels that become one."""
+    """Labels that are merged into one."""
 
     label: int
     name: str
@@ -32,14 +32,14 @@ class LabelGroup(NamedTuple):
 
 
 class Merged(NamedTuple):
-    """Labels that were merged; made by `merge_labels`.
+    """Merged labels; returned by `merge_labels`.
 
     Parameters
     ----------
     labels : Image
-        With the numbers of groups.
+        Image with the numbers of groups.
     names : dict of int to str
-        Of all groups, by number, whether the image has them or not.
+        Names of all groups, by number, including groups that the image does not have.
     numbers : dict of int to int
         The new number of each of the image's labels, by the old one.
 
@@ -63,12 +63,12 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     merge : str
-        Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N where one is
-        N:NAME=LABELS. LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*`` for all that no
-        group has; 0 stays 0 unless a group has it. Or the name of such a table: "aseg" (FreeSurfer), "synthseg",
-        "simnibs"; or a file of these: .toml, with a line NAME = LABELS for each, or .csv, with rows NAME,LABELS.
+        Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N for N:NAME=LABELS.
+        LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*`` for all labels in no other group;
+        0 stays 0 unless a group has it. Alternatively the name of a preset: "aseg" (FreeSurfer), "synthseg",
+        "simnibs"; or a file: .toml, with a line NAME = LABELS for each group, or .csv, with rows NAME,LABELS.
     names : dict of int to str, optional
-        What the image's labels are called, for groups that list names.
+        Names of the image's labels, for groups that list names.
 
     Returns
     -------
@@ -78,11 +78,11 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     Raises
     ------
     InputError
-        Labels that are not such numbers; groups that cannot be read; a label of two groups, or of none.
+        Labels are not such numbers; groups cannot be parsed; a label is in two groups, or in none.
 
     See Also
     --------
-    content : Takes the labels.
+    content : Use the labels.
 
     Examples
     --------
@@ -100,7 +100,7 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     if lost and rest is None:
         listed = ", ".join(map(str, lost[:UNGROUPED_LISTED])) + (", ..." if len(lost) > UNGROUPED_LISTED else "")
         raise InputError(
-            f"`merge`: expected each label of the image in a group, got none for {listed}; add them to a group, or "
+            f"`merge`: expected each label of the image in a group, got no group for {listed}; add them to a group, or "
             f"give NAME={REST} for all others"
         )
     numbers = {label: owner.get(label, rest or 0) for label in present}
@@ -108,14 +108,14 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
 
 
 def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
-    """The labels with other numbers; those that have none stay as they are."""
+    """Renumber labels; labels without a new number are unchanged."""
     table = np.arange(LARGEST_LABEL + 1, dtype=labels.data.dtype)
     table[list(numbers)] = list(numbers.values())
     return Image(table[labels.data.astype(np.uint16)], labels.affine)
 
 
 def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
-    """The smallest label of the same name, of each that has a smaller one."""
+    """Map each label to the smallest label of the same name, if that is another one."""
     first: dict[str, int] = {}
     for label in sorted(names):
         first.setdefault(names[label], label)
@@ -123,17 +123,17 @@ def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
 
 
 def is_preset(merge: str) -> bool:
-    """Whether a text is the name of a table of groups that comes with tetopt."""
+    """Return whether a text is the name of a preset of groups."""
     return merge.strip() in _presets()
 
 
 def groups_of(merge: str) -> list[LabelGroup]:
-    """The groups of a text as `merge_labels` takes it.
+    """Parse the groups for `merge_labels`.
 
     Raises
     ------
     InputError
-        A text of another kind; a name or a number twice; a file that cannot be read.
+        The text is invalid; a name or a number occurs twice; a file cannot be read.
     """
     if (file := named_file(merge)) is not None:
         try:
@@ -146,7 +146,7 @@ def groups_of(merge: str) -> list[LabelGroup]:
 
 
 def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
-    """The groups of rows of a name and its labels, those of one name together."""
+    """Return the groups in rows of a name and its labels; rows with the same name are merged."""
     groups: dict[str, list[object]] = {}
     for name, labels in rows:
         groups.setdefault(name, []).extend(labels)
@@ -154,34 +154,34 @@ def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
 
 
 def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
-    """Number, name and labels of NAME=LABELS."""
+    """Parse the number, name and labels of NAME=LABELS."""
     match = GROUP.fullmatch(words)
     members = tuple(part.strip() for part in match[3].split(",")) if match else ()
     if match is None or not all(members):
         raise InputError(
             f'`merge`: expected NAME=LABELS, separated by semicolons, such as "white=2,41; grey=3,42; soft=500-530", a '
-            f'file .toml or .csv, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
+            f'.toml or .csv file, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
         )
     return match[1], " ".join(match[2].split()), members
 
 
 def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelGroup]:
-    """The groups with their numbers, which differ, as their names do."""
-    rows = rows or [_of_words("")]  # which is none
+    """Return the groups with their numbers; numbers and names must be unique."""
+    rows = rows or [_of_words("")]  # raises InputError
     groups = [LabelGroup(k if row[0] is None else int(row[0]), *row[1:]) for k, row in enumerate(rows, 1)]
     for what in ("name", "label"):
         taken = [getattr(group, what) for group in groups]
         if twice := [each for each in taken if taken.count(each) > 1]:
-            raise InputError(f"`merge`: expected another {what} for each group, got {twice[0]} twice")
+            raise InputError(f"`merge`: expected a different {what} for each group, got {twice[0]} twice")
     if max(group.label for group in groups) > LARGEST_LABEL:
         raise InputError(f"`merge`: expected numbers of groups up to {LARGEST_LABEL}")
     if sum(REST in group.members for group in groups) > 1:
-        raise InputError(f"`merge`: expected {REST} in one group, got it in two")
+        raise InputError(f"`merge`: expected {REST} in at most one group, got it in two")
     return groups
 
 
 def _members(groups: list[LabelGroup], names: Mapping[int, str]) -> tuple[dict[int, int], int | None]:
-    """The group's number of each label that one has, and of all others."""
+    """Return the number of the group of each label, and that of all other labels."""
     owner: dict[int, int] = {}
     rest = None
     for group in groups:
@@ -192,12 +192,12 @@ def _members(groups: list[LabelGroup], names: Mapping[int, str]) -> tuple[dict[i
             for label in _labels_of(word, names):
                 if owner.setdefault(label, group.label) != group.label:
                     other = next(each.name for each in groups if each.label == owner[label])
-                    raise InputError(f"`merge`: label {label} is in two groups, {other} and {group.name}; name it once")
+                    raise InputError(f"`merge`: label {label} is in two groups, {other} and {group.name}; list it once")
     return owner, rest
 
 
 def _labels_of(word: str, names: Mapping[int, str]) -> list[int]:
-    """The labels that a number, a range or a name means."""
+    """Return the labels that a number, a range or a name refers to."""
     if (match := RANGE.fullmatch(word)) is None:
         try:
             return labels_named(word, names)
@@ -205,7 +205,7 @@ def _labels_of(word: str, names: Mapping[int, str]) -> list[int]:
             raise InputError(f"`merge`: {error}") from error
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last <= LARGEST_LABEL:
-        raise InputError(f"`merge`: expected labels, or a rising range of them, up to {LARGEST_LABEL}, got {word}")
+        raise InputError(f"`merge`: expected labels or an increasing range up to {LARGEST_LABEL}, got {word}")
     return list(range(first, last + 1))
 
 

@@ -1,1 +1,1 @@
-"""A mesh too large for one memory, optimised in parts, round by round: what they share stays, and is inside next."""
+"""Meshes larger than memory, optimised in parts and rounds: shared nodes stay, and are inside a part in the next."""

@@ -1,10 +1,10 @@
-"""Which cells go to which part in a round, and the whole put together again.
+"""Assignment of cells to parts in each round, and joining of the parts.
 
-Parts are boxes of about equal work: the cells' centroids are divided by planes across the axes, one axis after the
-other, each time into slabs of equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than
-two at a time). A part's surface follows its cells. Every round the planes lie elsewhere, so that what a part shared
-with others, and had to leave as it was, is inside of one in the next. A curve through the cells (Morton's) would be one
-sort, but its parts have ragged surfaces or two pieces, and boxes of voxels up to the whole volume.
+Parts are boxes of about equal work: planes divide the cells' centroids along one axis after the other into slabs of
+equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than two slabs at a time). A part's
+surface follows its cells. The planes move every round, so that nodes that a part shared with others, and could not
+move, are inside a part in the next round. A space-filling curve through the cells (Morton's) would need only one sort,
+but its parts have ragged surfaces or two components, and boxes of voxels up to the whole volume.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# By which fraction of a slab's width the planes of each round lie further along every axis.
+# Shift of the planes along every axis in each round, as a fraction of a slab's width.
 ROUND_SHIFTS = (0.0, 0.5, 0.25, 0.75)
 
 
 class Shared(NamedTuple):
-    """A mesh on a grid of ticks, and of which part each cell is."""
+    """A mesh on a grid of ticks, and the part of each cell."""
 
     ticks: NDArray[np.int64]  # (N, 3)
     cells: NDArray[np.int64]  # (M, 4)
-    part: NDArray[np.int64]  # (M,) from 0, each with a cell at least
+    part: NDArray[np.int64]  # (M,) from 0, each with at least one cell
 
 
 class Piece(NamedTuple):
@@ -33,11 +33,11 @@ class Piece(NamedTuple):
 
     ticks: NDArray[np.int64]  # (n, 3)
     cells: NDArray[np.int64]  # (m, 4) rows of `ticks`
-    nodes: NDArray[np.int64]  # (n,) rows of the whole mesh's
+    nodes: NDArray[np.int64]  # (n,) their rows in the whole mesh
 
 
 def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
-    """Numbers of slabs along each axis, at least `n_parts` parts in all, so that these are as near to cubes as can be.
+    """Return the number of slabs along each axis that gives at least `n_parts` parts as close to cubes as possible.
 
     Examples
     --------
@@ -53,25 +53,25 @@ def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
 def cut(
     centroids: NDArray[np.float64], weights: NDArray[np.float64], counts: Sequence[int], shift: float
 ) -> NDArray[np.int64]:
-    """The part of each cell, (M,) int64, numbered from 0 without gaps.
+    """Return the part of each cell, (M,) int64, numbered from 0 without gaps.
 
     Parameters
     ----------
     centroids : (M, 3) float64
-        Of the cells, in any unit.
+        Centroids of the cells, in any unit.
     weights : (M,) float64
-        What each cell is of a part's work.
+        Work of each cell.
     counts : sequence of three int
         Slabs along each axis.
     shift : float
-        0 to 1, of a slab: where the first plane lies. Unless it is 0 there is one more slab along each axis that is
-        divided at all, the first and the last of which are smaller.
+        Position of the first plane, 0 to 1 slab. Unless it is 0, each divided axis has one more slab, and its first and
+        last slabs are smaller.
     """
     part = np.zeros(len(centroids), dtype=np.int64)
     for axis, count in enumerate(counts):
         if count == 1:
             continue
-        # Within each part so far, cells in the order of their place along the axis; ties in that of their numbers.
+        # Within each part so far, sort cells by position along the axis, ties by number.
         order = np.lexsort((centroids[:, axis], part))
         total = np.cumsum(weights[order])
         start = np.flatnonzero(np.diff(part[order], prepend=-1))
@@ -85,7 +85,7 @@ def cut(
 
 
 def pieces(mesh: Shared) -> list[Piece]:
-    """The parts of a mesh, their nodes and cells in the order that these have in the whole."""
+    """Return the parts of a mesh; nodes and cells keep the order of the whole mesh."""
     order = np.argsort(mesh.part, kind="stable")
     bounds = np.searchsorted(mesh.part[order], np.arange(mesh.part.max() + 2))
     result = []
@@ -96,12 +96,12 @@ def pieces(mesh: Shared) -> list[Piece]:
 
 
 def joined(ticks: Sequence[NDArray[np.int64]], cells: Sequence[NDArray[np.int64]]) -> Shared:
-    """Parts put together: nodes in the same place, which parts share, become one.
+    """Join parts: shared nodes, which are in the same place, become one.
 
-    Nodes are numbered part by part, those that came with an earlier part left out; cells, too, go part by part.
+    Nodes and cells are numbered part by part; a shared node belongs to the first of its parts.
     """
     every = np.concatenate(ticks)
-    # Rows as one key each; ticks are below 2^31 in size, so that three of them take 93 bits.
+    # Whole rows are compared: ticks are below 2^31, so that three of them would take 93 bits in a single key.
     _, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first, kind="stable")] = np.arange(len(first))

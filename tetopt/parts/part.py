@@ -1,7 +1,7 @@
-"""One part of a mesh, from a file to a file: measured, optimised, or its cells' fields taken. This is what workers run.
+"""The work on one part of a mesh, from file to file: measure it, optimise it, or compute its cell fields.
 
-A part lies on the whole mesh's grid of ticks, in which its own is only shifted by whole voxels; so the voxels that its
-cells hold are those that they hold in the whole, to the last one, and its shared nodes stay to the last bit.
+Workers run this. A part lies on the whole mesh's grid of ticks, shifted only by whole voxels; therefore its cells
+contain exactly the same voxels as in the whole mesh, and its shared nodes stay the same to the last bit.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from tetopt.mesh import Mesh
 from tetopt.parts.work import checksum, done_path, load_arrays, open_volume, save_arrays
 from tetopt.start.sizes import Sizes
 
-MARGIN_SIZE = 2  # voxels around a part's nodes: as far as the image is looked at beside a facet, and one more
+MARGIN_SIZE = 2  # voxels around a part's nodes: the reach of the sampling beside a facet, and one more
 
 Kind = Literal["measure", "improve", "fields"]
 
 
 class PartSettings(NamedTuple):
-    """What all parts of a run have in common."""
+    """Settings shared by all parts of a run."""
 
     k_D: float
     shape_power: float
     min_dihedral: float  # degrees
     tolerance: float
-    iterations: int  # in all rounds together
-    n_early: int  # the first of them, in which nodes are exchanged
-    smallest: float  # mm, as of `Sizes`
+    iterations: int  # total over all rounds
+    n_early: int  # number of first iterations, which exchange nodes
+    smallest: float  # mm, see `Sizes`
     longest: float
     gradation: float | None
     shape: tuple[int, ...]  # of the whole image
@@ -49,20 +49,20 @@ class PartSettings(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """What came of a part, besides its mesh."""
+    """The results of a part in addition to its mesh."""
 
-    of: str  # checksum of what it was made of
-    E: float  # its part of the whole's
+    of: str  # checksum of its input
+    E: float  # its contribution to that of the whole mesh
     E_G: float
     E_D: float
     squares: float
     n_voxels: int
     n_nodes: int
-    movement: float  # of the last iteration, as in a `IterationRecord`
+    movement: float  # of the last iteration, see `IterationRecord`
 
 
 def box_of_ticks(ticks: NDArray[np.int64], settings: PartSettings) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The voxels of a part, start to before stop (3,) each: those around its nodes, within the image."""
+    """Return the voxels around a part's nodes, within the image: start (inclusive) and stop (exclusive), (3,) each."""
     index = ticks * 2.0**-settings.bits
     start = np.maximum(np.floor(index.min(axis=0)).astype(np.int64) - MARGIN_SIZE, 0)
     stop = np.minimum(np.ceil(index.max(axis=0)).astype(np.int64) + MARGIN_SIZE + 1, settings.shape)
@@ -70,7 +70,7 @@ def box_of_ticks(ticks: NDArray[np.int64], settings: PartSettings) -> tuple[tupl
 
 
 def work_on(name: str) -> Numbers:
-    """Do what a part's file says, unless it is done already; the numbers, which stand in the other file, too.
+    """Process a part's file unless that is done already; return the numbers, which are also in the result file.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def work_on(name: str) -> Numbers:
 
 
 def numbers_in(path: Path, of: str) -> Numbers | None:
-    """The numbers of a part that is done, if it was made of what has this checksum, and is not damaged since."""
+    """Return the numbers of a finished part if its input had this checksum and its file is not damaged."""
     if not path.exists():
         return None
     try:
@@ -112,10 +112,10 @@ def numbers_in(path: Path, of: str) -> Numbers | None:
 
 
 def _fields(image: Image, mesh: Mesh, whole: Whole, nearest: NDArray[np.int64]) -> dict[str, NDArray]:
-    """What the image is in each cell, as of `tetopt.model.fields.cell_fields`.
+    """Return the image's fields of cells, see `tetopt.model.fields.cell_fields`.
 
-    `nearest`, (M, 3), are the voxels that stand for cells without any: those of the whole, since rounding goes to
-    even numbers in the middle between two voxels, and which are even depends on where the part begins.
+    `nearest`, (M, 3), are the voxels that represent cells without any. They are computed for the whole mesh, because
+    halfway between two voxels rounding goes to the even one, which depends on where the part begins.
     """
     moments, (low, high) = cell_moments_and_ranges(image, mesh, whole.bits)
     is_empty = moments.n_voxels == 0
@@ -127,7 +127,7 @@ def _fields(image: Image, mesh: Mesh, whole: Whole, nearest: NDArray[np.int64]) 
 def _improved(
     image: Image, mesh: Mesh, whole: Whole, settings: PartSettings, text: dict[str, Any]
 ) -> tuple[dict[str, NDArray], Numbers]:
-    """The part after the iterations that are asked for, which may be none."""
+    """Return the part after the requested iterations, which may be none."""
     run = Run(plain(image), mesh, settings.k_D, settings.shape_power, is_graded=True, whole=whole)
     sizes = Sizes(settings.smallest, gradation=settings.gradation, longest=settings.longest).prepared(3)
     first, last = text["iterations"]

@@ -1,9 +1,9 @@
-"""A mesh in rounds of parts: cut, optimised part by part, joined, and cut elsewhere.
+"""Optimisation in rounds of parts: the mesh is cut, optimised part by part, joined, and cut elsewhere.
 
-Each round moves and exchanges everything but what parts share, which is a fifth of the nodes in parts of 5,000; the
-next one's planes lie elsewhere. Each part is normalised by the whole initial mesh, so that what it wins is what E falls
-by, and keeps as many nodes as it has, or its part of those that are still to come. What came of a round does not
-depend on who ran its parts, nor on how many at a time.
+Each round moves and exchanges everything except shared nodes, a fifth of the nodes in parts of 5,000; the planes of the
+next round lie elsewhere. Each part is normalised by the whole initial mesh, so that its gain is the decrease of E, and
+keeps its number of nodes, or gets its fraction of those still to be added. The result of a round does not depend on
+which workers run its parts, or on how many run at a time.
 """
 
 from __future__ import annotations
@@ -50,51 +50,51 @@ from tetopt.parts.work import (
 from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
 
-MOST_CELLS = 100_000  # of a part: 17,000 nodes, of which a tenth to a fifth are shared, and some seconds of a round
-MOST_VOXELS = 2**25  # of the cells of a part, 34 million: with its sums below 1.5 GB
+MOST_CELLS = 100_000  # in a part: 17,000 nodes, a tenth to a fifth of them shared, and some seconds per round
+MOST_VOXELS = 2**25  # in the cells of a part, 34 million: with sums less than 1.5 GB
 # Sweeps in a round. Four rounds of 4 left 3.5 % more E_D than one piece of 16 sweeps (MNI152, 40,000 nodes, 4 parts),
-# six of 3 2.4 %: what is shared in the last round, and stays, has had more of its sweeps before.
+# six rounds of 3 left 2.4 %: nodes that are shared, and fixed, in the last round have had more sweeps before.
 ROUND_SWEEPS = 3
-BOX_EXCESS = 1.25  # of the largest box of any round over that of the first cut: 1.08 was measured
+BOX_EXCESS = 1.25  # ratio of the largest box of any round to that of the first cut: 1.08 was measured
 
 Runner = Callable[[Sequence[str]], Iterator[Any]]
-"""Runs `work_on` for each of the files of parts, and yields as they end."""
+"""Runs `work_on` for each part's file, and yields as they end."""
 
 
 class PartsRequest(NamedTuple):
-    """What is asked of a run in parts."""
+    """The settings of a run in parts."""
 
     nodes: int
-    n_parts: int  # at least
+    n_parts: int  # minimum
     k_D: float
     iterations: int  # rounded up to whole rounds
     shape_power: float
     min_dihedral: float  # degrees
-    tolerance: float  # E that falls by less in a sweep, in the mean of a round, ends the run
+    tolerance: float  # the run ends when E decreases by less per sweep, averaged over a round
     sizes: Sizes | None
-    checksum: str  # of all this and of the image: of the same a run is gone on with
+    checksum: str  # of all these and the image; a run with the same one is resumed
 
 
 class Round(NamedTuple):
-    """What a round is about to do, for who watches."""
+    """The state of a round, for progress reports."""
 
     number: int  # from 0, which measures the initial mesh
-    n_rounds: int  # at most, with the last one, which takes the cells' fields
+    n_rounds: int  # at most, including the last one, which computes cell fields
     kind: Kind
     n_parts: int
-    done: int  # parts of it that are done
+    done: int  # number of finished parts
 
 
 class Parted(NamedTuple):
-    """What came of a run in parts."""
+    """The results of a run in parts."""
 
     result: MeshingResult  # with a record for each round
-    fields: dict[str, NDArray]  # of each cell what the image is there: n_voxels, mean, variance, min, max
-    part: NDArray[np.int64]  # (M,) of each cell, rising
+    fields: dict[str, NDArray]  # the image in each cell: n_voxels, mean, variance, min, max
+    part: NDArray[np.int64]  # (M,) of each cell, ascending
 
 
 def in_turn(names: Sequence[str]) -> Iterator[Any]:
-    """One part after the other, in this process."""
+    """Work on one part after the other, in this process."""
     for name in names:
         yield work_on(name)
 
@@ -107,42 +107,42 @@ def mesh_in_parts(
     watch: Callable[[Round, list[IterationRecord]], None] = lambda now, history: None,
     check: Callable[[Mesh], None] = lambda initial: None,
 ) -> Parted:  # fmt: skip
-    """A graded mesh of an image's box, optimised in parts, as `mesh_image` does in one piece.
+    """Create a graded mesh of an image's box in parts, as `mesh_image` does in one piece.
 
     Parameters
     ----------
     request : PartsRequest
     folder : Path
-        Of work. All that is done stays in it, so that the same request goes on where it ended, whatever ended it;
-        unless it is refused before a part begins.
+        The work directory. It keeps all results, so that the same request resumes after any interruption, unless it is
+        refused before the first part begins.
     known : Statistics, optional
-        Of the image, if a pass over it has taken them.
+        Statistics of the image, if a pass over it has computed them.
     volume : VolumeFile or Image, optional
-        The image, unless `tetopt.parts.work.save_volume` has noted in the folder where its voxels are.
+        The image, unless `tetopt.parts.work.save_volume` has recorded the location of its voxels in the folder.
     crew : callable
-        Given how many parts there are, and the bytes that the largest takes, for as long as its block lasts what runs
+        Takes the number of parts and the bytes of the largest; returns a context manager that gives a function to run
         them.
     is_over : callable
-        Asked when a part is done. Once it is true the mesh of the last complete round is the result.
+        Called after each part. Once it returns True, the result is the mesh of the last complete round.
     watch : callable
-        Told of each part that is done.
+        Called after each part.
     check : callable
-        Given the initial mesh before a part begins, to refuse what it can tell.
+        Called with the initial mesh before the first part; may raise InputError.
 
     Returns
     -------
     Parted
-        The same bits whatever runs the parts.
+        Identical to the last bit, whatever runs the parts.
 
     Raises
     ------
     InputError
-        As `octree_mesh`; a folder of another request or of another run; what `crew` and the parts raise; an end before
-        the initial mesh is measured.
+        For the reasons of `octree_mesh`; the folder belongs to another request or another run; errors of `crew` and the
+        parts; the run ends before the initial mesh is measured.
     """
     with locked(folder), gone_if_refused(folder) as keep:
         state = load_state(folder, request.checksum)
-        if state is None and volume is not None:  # what a run that got no further has noted may be of another image
+        if state is None and volume is not None:  # an earlier run without a state may have recorded another image
             save_volume(folder, volume)
         image = open_volume(folder)
         state = state or _begun(request, folder, image, known)
@@ -153,7 +153,7 @@ def mesh_in_parts(
         with crew(int(np.prod(counts)), largest) as runner:
             keep()
             ended = "iterations"
-            # Asked before a round, also of a run that went on: it may have ended when it had converged.
+            # Checked before each round, also in a resumed run, which may have converged already.
             while not _is_converged(request, state) and state.n_rounds <= _n_rounds(request):
                 after = _round(run, state, counts, runner)
                 if after is None:
@@ -175,12 +175,12 @@ class _Run(NamedTuple):
 
 
 def _n_rounds(request: PartsRequest) -> int:
-    """Rounds that improve the mesh."""
+    """Return the number of rounds that improve the mesh."""
     return ceil(request.iterations / ROUND_SWEEPS)
 
 
 def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics | None) -> WorkState:
-    """The state before the first round: the octree, on the grid of ticks."""
+    """Create the state before the first round: the octree on the grid of ticks."""
     begin = time.perf_counter()
     of_image = statistics(image) if known is None else known
     mesh = octree_mesh(Content(image, statistics=of_image), request.nodes, request.sizes)
@@ -209,7 +209,7 @@ def _history(state: WorkState) -> list[IterationRecord]:
 
 
 def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> list[Piece]:
-    """The parts of the mesh as it stands."""
+    """Cut the current mesh into parts."""
     mesh = load_arrays(mesh_path(run.folder, state.n_rounds))[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     part = cut(index[mesh["cells"]].mean(axis=1), _weights(index, mesh["cells"]), counts, shift)
@@ -222,12 +222,12 @@ def _initial(run: _Run, state: WorkState) -> Mesh:
 
 
 def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
-    """What each cell is of the most that a part may hold: one of its cells, and its voxels."""
+    """Return the weight of each cell as a fraction of a part's capacity, by cells and by voxels."""
     return 1.0 / MOST_CELLS + np.abs(volumes(index, cells)) / MOST_VOXELS
 
 
 def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
-    """Slabs along each axis: so many that no part holds too much, whatever machine it is."""
+    """Return the slabs along each axis that keep every part within its capacity, on any machine."""
     mesh = load_arrays(run.folder / INITIAL_NAME)[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     fewest = ceil(_weights(index, mesh["cells"]).sum())
@@ -235,7 +235,7 @@ def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
 
 
 def expected_parts(grid: Image, request_nodes: int, n_parts: int) -> tuple[int, float]:
-    """About how many parts a round will have, and the bytes that one takes, before there is a mesh."""
+    """Estimate the number of parts in a round and the bytes of each, before there is a mesh."""
     n_cells, n_voxels = CELLS_PER_NODE[3] * request_nodes, prod(grid.shape)
     fewest = ceil(n_cells / MOST_CELLS + n_voxels / MOST_VOXELS)
     number = prod(counts_of(max(n_parts, fewest), tuple(grid.spacing * grid.shape)))
@@ -243,7 +243,7 @@ def expected_parts(grid: Image, request_nodes: int, n_parts: int) -> tuple[int, 
 
 
 def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:
-    """Voxels of the box and cells of each part, by the mesh as it stands."""
+    """Yield the voxels in the box and the cells of each part of the current mesh."""
     for piece in _cut(run, state, counts, ROUND_SHIFTS[0]):
         start, stop = box_of_ticks(piece.ticks, _settings(state))
         n_voxels = int(np.prod(np.subtract(stop, start)))
@@ -251,7 +251,7 @@ def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterato
 
 
 def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner) -> WorkState | None:
-    """One round; None if it was cut short."""
+    """Run one round; None if it was interrupted."""
     number = state.n_rounds
     kind: Kind = "measure" if number == 0 else "improve"
     parts = _cut(run, state, counts, ROUND_SHIFTS[max(number - 1, 0) % len(ROUND_SHIFTS)])
@@ -265,7 +265,7 @@ def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner)
 
 
 def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]) -> WorkState:
-    """The state after a round, on disk."""
+    """Save the state after a round and return it."""
     number, settings, history = state.n_rounds, _settings(state), _history(state)
     E_G, squares = sum(each.E_G for each in numbers), sum(each.squares for each in numbers)
     E_D = sum(each.E_D for each in numbers)
@@ -290,7 +290,7 @@ def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]
 
 
 def _prepared(run: _Run, state: WorkState, parts: list[Piece], kind: Kind) -> list[Path]:
-    """The files that say what is to be made of each part, in their order."""
+    """Write the input files of the parts and return their paths, in order."""
     folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
     folder.mkdir(exist_ok=True)
     n_nodes = 1 + max(int(piece.nodes[-1]) for piece in parts)
@@ -305,8 +305,8 @@ def _prepared(run: _Run, state: WorkState, parts: list[Piece], kind: Kind) -> li
 
 
 def _is_run(run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: list[Path], runner: Runner) -> bool:
-    """Run the parts; False if they were cut short before all were done."""
-    # The largest first, as it is last to end.
+    """Run the parts; return False if they were interrupted before all were done."""
+    # The largest first, as it takes longest.
     order = sorted(range(len(parts)), key=lambda at: (-len(parts[at].cells), at))
     run.watch(now, _history(state))
     n_done = 0
@@ -314,12 +314,12 @@ def _is_run(run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: 
         run.watch(now._replace(done=n_done), _history(state))
         if n_done < len(parts) and run.is_over():
             break
-    # By their number and not by their files, which may be those of a run that was stopped here and took its fields.
+    # Count parts and not files, which may come from an earlier run that was stopped here and computed its fields.
     return n_done == len(parts)
 
 
 def _is_converged(request: PartsRequest, state: WorkState) -> bool:
-    """Whether E has fallen by too little in the last round, once nodes are exchanged no more."""
+    """Return whether E has decreased too little in the last round, once exchanges are over."""
     history, settings = _history(state), _settings(state)
     if len(history) < 2 or history[-2].iteration < settings.n_early or history[-2].E <= 0.0:
         return False
@@ -327,15 +327,15 @@ def _is_converged(request: PartsRequest, state: WorkState) -> bool:
 
 
 def _finished(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str) -> Parted:
-    """The result of the rounds that are complete, its cells in the order of the parts that took their fields."""
+    """Return the result of the complete rounds, with cells in the order of the parts that computed their fields."""
     history = _history(state)
     if not history:
-        raise InputError(f"{run.folder}: ended before the first round was complete; run this again to go on with it")
+        raise InputError(f"{run.folder}: ended before the first round was complete; run this again to resume")
     parts = _cut(run, state, counts, ROUND_SHIFTS[0])
     whole = run._replace(is_over=lambda: False)
     paths = _prepared(run, state, parts, "fields")
     now = Round(state.n_rounds, _n_rounds(run.request) + 2, "fields", len(parts), 0)
-    if not _is_run(whole, state, now, parts, paths, runner):  # it knows of the end as well, and begins no more parts
+    if not _is_run(whole, state, now, parts, paths, runner):  # interrupted, too
         _is_run(whole, state, now, parts, paths, in_turn)
     done = [load_arrays(done_path(path))[0] for path in paths]
     mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])

@@ -1,13 +1,13 @@
-"""The work directory of a run in parts: all that there is of it, so that a rerun goes on where another one ended.
+"""The work directory of a run in parts, which holds its whole state, so that a rerun resumes where it ended.
 
-volume.json, voxels.npy       where the voxels are: of an image that is in memory, in the folder itself
-state.json                    what was asked, and what is known after the last complete round
-mesh-R.npz                    the mesh after round R; of the rounds only the last
-round-R/part-P.npz            what a part of the next round is to be made of
-round-R/done-P.npz            and what came of it
-logs/                         what dask and a batch system's jobs say
+volume.json, voxels.npy       the location of the voxels; for an image in memory, the voxels themselves
+state.json                    the request, and the state after the last complete round
+mesh-R.npz                    the mesh after round R, only of the last round
+round-R/part-P.npz            the input of a part of the next round
+round-R/done-P.npz            its result
+logs/                         output of dask and of a batch system's jobs
 
-`tetopt.system.work_directory` says what else may not lie there.
+`tetopt.system.work_directory` refuses all other entries.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ LAYOUT = Layout(
     rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz|seen-\d+",
     {r"round-\d+": r"(part|done)-\d+\.npz", LOGS_NAME: ".+", "dask": None},
 )
-TEXT_NAME = "text"  # of the entry of a file of arrays that has what else is to be known, in JSON
+TEXT_NAME = "text"  # entry of a file of arrays with further information, in JSON
 
 
-# What zipfile and numpy say of files with other bytes than were written. A number of a length may stand for any memory.
+# Errors that zipfile and numpy raise for damaged files. A damaged length may ask for any amount of memory.
 DAMAGE_ERRORS = (
     OSError, EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError, RuntimeError, struct.error,
     zipfile.BadZipFile, zlib.error,
@@ -55,34 +55,34 @@ DAMAGE_ERRORS = (
 
 
 class VolumeFile(NamedTuple):
-    """Where the voxels of a run in parts are."""
+    """The location of the voxels of a run in parts."""
 
     path: Path
-    volume: int | None = None  # which of several, as of `tetopt.io.stored_images.open_stored`
-    crop: Bounds | None = None  # likewise
+    volume: int | None = None  # one of several volumes, see `tetopt.io.stored_images.open_stored`
+    crop: Bounds | None = None  # see there
 
     def opened(self) -> Image:
-        """The image; InputError as `open_stored`."""
-        with warnings.catch_warnings():  # which were said when the image was first opened
+        """Open the image; InputError for the reasons of `open_stored`."""
+        with warnings.catch_warnings():  # they were issued when the image was first opened
             warnings.simplefilter("ignore")
             return open_stored(self.path, volume=self.volume, crop=self.crop)
 
 
 def locked(folder: Path) -> AbstractContextManager[None]:
-    """The work directory, for one run alone; see `tetopt.system.work_directory.locked`."""
+    """Lock the work directory for a single run; see `tetopt.system.work_directory.locked`."""
     return work_directory.locked(folder, LAYOUT, folder)
 
 
 def removed(folder: Path) -> list[str]:
-    """Remove the work directory; the names of what stays, which is not tetopt's."""
+    """Remove the work directory; return the names of entries that are not tetopt's, which remain."""
     return discard(folder, LAYOUT)
 
 
 @contextmanager
 def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
-    """A work directory without a state goes again with an InputError, unless what is yielded has been called by then.
+    """Remove a work directory without a state after an InputError, unless the yielded function was called before.
 
-    Otherwise what was refused would stand in the way of the request that is mended.
+    Otherwise the remains of the refused request would block the corrected one.
     """
     is_kept = (folder / STATE_NAME).exists()
 
@@ -99,14 +99,14 @@ def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
 
 
 def identity(file: VolumeFile | None, sha256: str) -> tuple[str, str | None]:
-    """What shows that an image is the same one, and where it is if it is left in its file, which is not read here."""
+    """Return a checksum that identifies an image, and its path if it is left in its file, which is not read here."""
     if file is None:
         return sha256, None
     return stored_checksum(file.path), str(file.path.resolve())
 
 
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
-    """Note where the voxels are, or leave those of an image in memory in the folder, from where they are mapped."""
+    """Record the location of the voxels, or save those of an image in memory to the folder, to be mapped from there."""
     create(folder, LAYOUT)
     if isinstance(volume, Image):
         with written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary, temporary.open("wb") as stream:
@@ -118,7 +118,7 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
 
 
 def open_volume(folder: Path) -> Image:
-    """The image whose voxels a work directory is about; InputError as `open_stored`, or the folder is damaged."""
+    """Open the image of a work directory; InputError for the reasons of `open_stored`, or if the folder is damaged."""
     path = folder / VOLUME_NAME
     try:
         words = json_of(own_bytes(path).decode())
@@ -133,16 +133,16 @@ def open_volume(folder: Path) -> Image:
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray], text: dict[str, Any]) -> None:
-    """Write arrays and what else is to be known of them, whole or not at all; each with its checksum (CRC-32)."""
+    """Write arrays and further information, whole or not at all; each with its checksum (CRC-32)."""
     words = np.frombuffer(json.dumps(text, sort_keys=True).encode(), dtype=np.uint8)
     size = sum(array.nbytes for array in arrays.values())
     with written_whole(path, size) as temporary, temporary.open("wb") as stream:
-        # The text last: a length that is damaged may swallow what comes behind, and without the text is noticed.
+        # The text last: a damaged length may swallow the following entries, and a missing text is noticed.
         np.savez(stream, **arrays, **{TEXT_NAME: words})  # type: ignore[arg-type]
 
 
 def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """What `save_arrays` wrote; InputError if the file is damaged."""
+    """Load a file of `save_arrays`; InputError if it is damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -153,13 +153,13 @@ def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
-    """What is done without a file: a part is made again, and without the mesh or the state there is no way on."""
+    """Return the error for a damaged file that cannot be recreated."""
     words = plain(" ".join(str(error).split()))
-    return InputError(f"{path}: the file is damaged ({words}); remove {path.parent}, and run this again")
+    return InputError(f"{path}: the file is damaged ({words}); remove {path.parent} and run this again")
 
 
 def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
-    """SHA-256 of arrays and what else is to be known of them."""
+    """Return the SHA-256 of arrays and further information."""
     digest = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -169,15 +169,15 @@ def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
 
 
 class WorkState(NamedTuple):
-    """What is known after a round that is complete."""
+    """The state after a complete round."""
 
-    request: str  # checksum of what was asked
-    n_rounds: int  # that are complete; the first one measures the initial mesh
-    known: dict[str, Any]  # numbers by name
+    request: str  # checksum of the request
+    n_rounds: int  # number of complete rounds; the first one measures the initial mesh
+    known: dict[str, Any]  # values by name
 
 
 def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None:
-    """Note that a round is complete: its mesh first, then the state, by which alone it counts, then the rest goes."""
+    """Save a complete round: first its mesh, then the state, which makes it valid; then remove older files."""
     save_arrays(mesh_path(folder, state.n_rounds), mesh, {})
     save_json(folder / STATE_NAME, {"state": state._asdict(), "checksum": checksum({}, state._asdict())})
     for old in folder.glob("mesh-*.npz"):
@@ -189,12 +189,12 @@ def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None
 
 
 def load_state(folder: Path, request: str) -> WorkState | None:
-    """What is known after the last complete round of a run of this request; None if there is none.
+    """Return the state after the last complete round of a run with this request; None if there is none.
 
     Raises
     ------
     InputError
-        The folder is that of another request, or the file is damaged.
+        The folder belongs to another request, or the file is damaged.
     """
     path = folder / STATE_NAME
     if not path.exists():
@@ -203,27 +203,27 @@ def load_state(folder: Path, request: str) -> WorkState | None:
         words = json_of(own_bytes(path).decode())
         state = WorkState(**words["state"])
         if words["checksum"] != checksum({}, state._asdict()):
-            raise ValueError("its checksum is another one")
+            raise ValueError("its checksum does not match")
     except DAMAGE_ERRORS as error:
         raise _damaged(path, error) from error
     if state.request != request:
         raise InputError(
-            f"{folder}: work directory of another run that has not finished; continue it with the same options and "
+            f"{folder}: work directory of another, unfinished run; resume it with the same options and "
             "image, or remove it"
         )
     return state
 
 
 def mesh_path(folder: Path, number: int) -> Path:
-    """Where the mesh after so many rounds is."""
+    """Return the path of the mesh after a number of rounds."""
     return folder / f"mesh-{number}.npz"
 
 
 def round_folder(folder: Path, number: int) -> Path:
-    """Where the parts of a round are, by how many rounds are complete."""
+    """Return the folder of a round's parts, given the number of complete rounds."""
     return folder / f"round-{number}"
 
 
 def done_path(part: Path) -> Path:
-    """Where what comes of a part is, by where it is itself."""
+    """Return the path of a part's result, given that of its input."""
     return part.with_name(part.name.replace("part-", "done-"))

@@ -1,1 +1,1 @@
-"""Tables and pictures of results; knows nothing of how the numbers came to be."""
+"""Tables and pictures of results, independent of how the numbers were computed."""

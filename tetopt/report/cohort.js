@@ -1,13 +1,13 @@
-// The table of a cohort's subjects, sorted and filtered, their pictures, and how their numbers are distributed.
-// All texts go in as text, never as markup; only as many rows are drawn as a page of the table has.
+// The table of a cohort's subjects, with sorting and filtering, their pictures, and distributions of their numbers.
+// All texts are inserted as text, never as markup; only the rows of one page of the table are drawn.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const [KEY, STATUS, REASON, FLAGS, FLAG_COUNT, MESH, FILES, FIRST] = [0, 1, 2, 3, 4, 5, 6, 7]; // of a row
 const PAGE_ROWS = 50; // drawn at once in the table: 50 pictures and some 20 columns draw in a tenth of a second
-const PAGE_TILES = 120; // likewise of pictures alone, which are what takes the time
+const PAGE_TILES = 120; // drawn at once without the table; pictures take most of the time
 const BINS = 24;
 const CHART = { width: 230, height: 74 };
-// What is to be looked at first; what failed has a table of its own above.
+// Subjects to look at first; failed ones have their own table above.
 const STATUSES = ["violated", "done", "missing", "failed"];
 const WORDS = { failed: "failed", missing: "not run", violated: "requirement violated", done: "done" };
 const STEPS = {
@@ -50,7 +50,7 @@ function written(value, unit, digits = 3) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Which rows, in which order
+// Selection and order of rows
 
 const collator = new Intl.Collator("en", { numeric: true });
 
@@ -61,7 +61,7 @@ function isIn(row) {
   return !state.text || textOf(row).includes(state.text);
 }
 
-const texts = new Map(); // of rows, in small letters: made once
+const texts = new Map(); // of rows, in lower case, computed once
 function textOf(row) {
   if (!texts.has(row)) {
     const values = row.slice(FIRST).filter((value) => typeof value === "string");
@@ -77,7 +77,7 @@ function compared(a, b) {
     return rank(a) - rank(b) || b[FLAG_COUNT] - a[FLAG_COUNT];
   }
   const [x, y] = [a, b].map((row) => (state.sort < 0 ? row[KEY] : valueOf(row, state.sort)));
-  if (x === null || y === null) return (x === null) - (y === null); // last, whichever way
+  if (x === null || y === null) return (x === null) - (y === null); // last, in either order
   const difference = isNumber(x) && isNumber(y) ? x - y : collator.compare(String(x), String(y));
   return state.isDown ? -difference : difference;
 }
@@ -90,7 +90,7 @@ function update(isSamePage) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The table, and the pictures alone
+// The table, and the view with pictures only
 
 function link(path, words) {
   return element("a", { href: path.split("/").map(encodeURIComponent).join("/"), textContent: words });
@@ -116,7 +116,7 @@ function pictureOf(r) {
 }
 
 function oddOf(row) {
-  const own = row[FLAGS].filter(([, column]) => column !== "violated"); // its reason says so
+  const own = row[FLAGS].filter(([, column]) => column !== "violated"); // its reason states this
   const words = own.map(([each]) => element("div", { className: "flag", textContent: each }));
   if (row[FLAG_COUNT] > row[FLAGS].length) words.push(element("div", { textContent: `and ${row[FLAG_COUNT] - row[FLAGS].length} more` }));
   if (row[STATUS] !== "done") words.unshift(element("div", { className: "bad", textContent: row[REASON] }));
@@ -203,7 +203,7 @@ function binsOf(c) {
   }
   values.sort((a, b) => a - b);
   const fraction = (part) => values[Math.round(part * (values.length - 1))];
-  // What lies far off would leave one bar for all others: it goes into the first and the last.
+  // Outliers would squeeze all others into one bar: they are counted in the first and the last.
   const reach = 3 * (fraction(0.75) - fraction(0.25)) || Infinity;
   let [low, high] = [Math.max(values[0], fraction(0.25) - reach), Math.min(values[values.length - 1], fraction(0.75) + reach)];
   const [isCutBelow, isCutAbove] = [values[0] < low, values[values.length - 1] > high];
@@ -215,7 +215,7 @@ function binsOf(c) {
     const [first, last] = [k === 0 ? -Infinity : ends[0], k === BINS - 1 ? Infinity : ends[1]];
     const isOpen = { low: k === 0 && isCutBelow, high: k === BINS - 1 && isCutAbove };
     const [least, most] = ends.map((end) => written(end, column.unit));
-    const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} and more` : `${least} to ${most}`;
+    const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} or more` : `${least} to ${most}`;
     return { words, ends, isOpen, holds: (value) => isNumber(value) && value >= first && value < last };
   });
 }
@@ -233,8 +233,8 @@ function chartOf(c) {
     const rows = members[k];
     if (!rows.length) return;
     const n = rows.filter((row) => row[FLAGS].some(([, name]) => name === column.name)).length;
-    const tall = (count) => (count ? Math.max((count / most) * (height - 4), 2) : 0); // a single subject is seen
-    const isOpen = bin.isOpen && (bin.isOpen.low || bin.isOpen.high); // how far out they are, the bar does not show
+    const tall = (count) => (count ? Math.max((count / most) * (height - 4), 2) : 0); // so that a single subject is visible
+    const isOpen = bin.isOpen && (bin.isOpen.low || bin.isOpen.high); // the bar does not show how far out they are
     const nameIn = (row) => (isOpen ? `${row[KEY]} ${written(valueOf(row, c), column.unit)}` : row[KEY]);
     const names = rows.slice(0, 8).map(nameIn).join(", ") + (rows.length > 8 ? ", ..." : "");
     const words = `${bin.words}: ${rows.length} subject${rows.length > 1 ? "s" : ""}${n ? `, ${n} flagged` : ""} (${names})`;
@@ -270,7 +270,7 @@ function drawCharts() {
   }
   const [usual, labels] = [false, true].map((is) => filled.filter((c) => data.columns[c].name.startsWith("labels.") === is));
   charts.replaceChildren(element("div", { className: "charts" }, ...usual.map(chartOf)));
-  if (same.length) charts.append(element("p", { className: "same", textContent: `The same in all that have it: ${same.join(", ")}.` }));
+  if (same.length) charts.append(element("p", { className: "same", textContent: `The same for all subjects that have it: ${same.join(", ")}.` }));
   if (!labels.length) return;
   const box = element("div", { className: "charts" });
   const details = element("details", {}, element("summary", { textContent: `Volumes of ${labels.length} labels` }), box);
@@ -280,7 +280,7 @@ function drawCharts() {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// What to show
+// Choice of the view
 
 const chips = element("div", { className: "chips" });
 

@@ -1,4 +1,4 @@
-"""Colours of labels, the same in every picture of a volume, also for the colour-blind; greys of intensities."""
+"""Colours of labels, suited to the colour-blind and the same in every picture of a volume; greys of intensities."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from tetopt.image import Image
 from tetopt.io.text import plain
 
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
-LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
+LISTED_LABELS = 12  # labels in a legend: more could not be distinguished by colour alone
 
 
 def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] | None = None) -> NDArray[np.float64]:
-    """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
+    """Return the colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
-    A label has the same colour in all pictures: its `own`, such as `tetopt.model.labels.LabelTable.colours` has it, or
-    that of its number (`tetopt.contents.labels.colours_by_number`). 0 is the background, always in light grey: tables
-    have it in black.
+    A label has the same colour in all pictures: its `own`, e.g. from `tetopt.model.labels.LabelTable.colours`, or
+    that of its number (`tetopt.contents.labels.colours_by_number`). 0, the background, is always light grey, although
+    label tables make it black.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
     Raises
     ------
     InputError
-        Labels that are not whole numbers in this range.
+        Labels are not whole numbers in this range.
     """
     check_labels("labels", labels)
     colours = colours_by_number(np.arange(int(labels.data.max()) + 1))
@@ -48,12 +48,12 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
 
 
 def plain_text(text: str) -> str:
-    """The text as matplotlib draws it letter by letter, and not as a formula between dollars."""
+    """Escape a text so that matplotlib draws its letters, and no formula between dollar signs."""
     return plain(text).replace("$", r"\$")
 
 
 def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[float, float]:
-    """What is drawn black and white: the 0.5 and the `brightest` percentile of all `values`, and never the same."""
+    """Return the values drawn black and white, always distinct: the 0.5 and the `brightest` percentile of `values`."""
     low, high = np.percentile(np.concatenate([part.ravel() for part in values]), [0.5, brightest])
     return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
 
@@ -61,16 +61,16 @@ def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[flo
 def legend_patches(
     colours: NDArray[np.float64], shown: NDArray[np.integer], names: Mapping[int, str] | None = None
 ) -> list[Patch]:
-    """A legend's entries: the `LISTED_LABELS` labels of which most is shown, ascending, then how many more there are.
+    """Return a legend's entries: the `LISTED_LABELS` labels that cover most, ascending, and the number of others.
 
     Parameters
     ----------
     colours : (K, 3) float64
-        As `label_colours` returns them.
+        The result of `label_colours`.
     shown : (up to K,) integer
-        How much of each label is shown, in any unit; what is not shown is not listed.
+        Visible amount of each label, in any unit; labels with 0 are not listed.
     names : mapping of label to text, optional
-        What labels are called.
+        Names of labels.
     """
     names = names or {}
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]

@@ -1,4 +1,4 @@
-"""What `tetopt view` shows, in a page (`tetopt.report.explore`) or a picture (`tetopt.report.scene.opened_mesh`)."""
+"""Contents of `tetopt view`, for a page (`tetopt.report.explore`) or picture (`tetopt.report.scene.opened_mesh`)."""
 
 from __future__ import annotations
 
@@ -18,49 +18,49 @@ from tetopt.model.labels import NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
 
 COLOUR_MAP = "viridis"  # perceptually even
-MOST_CATEGORIES = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
-NO_VALUE = "#aaaaaa"  # of cells whose value is not a number
-OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values do not stretch its colours
-# The fields that tetopt writes: they are quantities, even where their values are whole numbers.
+MOST_CATEGORIES = 128  # whole numbers with more values are a quantity: a longer list of colours is unreadable
+NO_VALUE = "#aaaaaa"  # colour of cells whose value is NaN
+OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field, which do not affect its colour range
+# Fields that tetopt writes: they are quantities, even if their values are whole numbers.
 FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
     "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa", "displacement": "mm",
     "von_mises": "kPa", "von_mises_nodes": "kPa", "young_nodes": "kPa", "density": "kg/m³",
 }  # fmt: skip
-LABEL_FIELD = "label"  # the cell data that a table's names and colours are of, and that labels are chosen by
-DISPLACEMENT = "displacement"  # the point data by which the mesh is deformed
+LABEL_FIELD = "label"  # the cell data to which a table's names and colours belong, and by which labels are selected
+DISPLACEMENT = "displacement"  # the point data that deform the mesh
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
-ROUNDED_FRACTION = 1e-9  # of the upper limit: a lower one within it is 0 but for rounding
-SEEN_FRACTION = 0.05  # of the mesh's diagonal: about so long the largest displacement is drawn at first, to be seen
-MOST_TIMES = 5.0  # that: the cells' shapes are lost beyond
-ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # of which, and powers of ten, a factor is one
+ROUNDED_FRACTION = 1e-9  # of the upper limit: a smaller lower limit is 0 up to rounding
+SEEN_FRACTION = 0.05  # of the mesh's diagonal: initial length of the largest displacement, so that it is visible
+MOST_TIMES = 5.0  # the initial factor: beyond, cells lose their shapes
+ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # times powers of ten, the values of the factor
 
 
 class Field(NamedTuple):
-    """One number a cell or a node, and how it is coloured."""
+    """One number per cell or node, and its colouring."""
 
     name: str
-    unit: str  # "" where none is known
-    values: NDArray[np.float32]  # (M,); of a field at the nodes the mean of each cell's corners
-    limits: tuple[float, float]  # between which the colour map runs; always apart
+    unit: str  # "" if unknown
+    values: NDArray[np.float32]  # (M,); for a field of nodes, the mean of each cell's corners
+    limits: tuple[float, float]  # the range of the colour map; always distinct
     categories: list[tuple[int, str]]  # value and colour "#rrggbb" of labels, ascending; empty for a quantity
-    nodes: NDArray[np.float32] | None = None  # (N,), to be interpolated; None for a field of the cells
-    step: int = 0  # of a load, from 1; 0 for what is of none, or of the only one
-    names: dict[int, str] = {}  # noqa: RUF012 - nobody changes it; what categories are called
+    nodes: NDArray[np.float32] | None = None  # (N,), interpolated; None for a field of cells
+    step: int = 0  # load step, from 1; 0 without a step, or for the only one
+    names: dict[int, str] = {}  # noqa: RUF012 - never changed; names of categories
 
 
 class Exhibit(NamedTuple):
-    """A mesh of tetrahedra to look at, and all that is shown with it."""
+    """A tetrahedral mesh to view, and all data shown with it."""
 
     mesh: Mesh
     fields: list[Field]  # at least one
-    skipped: list[str]  # names of data that are not shown
+    skipped: list[str]  # names of data not shown
     image: Image | None  # 3-D
     title: str
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
-    displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; of the only one under 0
-    n_nodes: int  # of cells of order 2 more than the mesh's, which alone are drawn
-    reactions: dict[int, dict[str, list[float]]]  # by step likewise, and set: (3,) mN that hold it
+    displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; a single one under 0
+    n_nodes: int  # includes the mid-edge nodes of order 2, which are not drawn
+    reactions: dict[int, dict[str, list[float]]]  # by the same steps and by set: its reaction, (3,) mN
 
 
 def exhibit(
@@ -73,42 +73,42 @@ def exhibit(
     reactions: dict[int, dict[str, list[float]]] | None = None,
     table: LabelTable = NO_TABLE,
 ) -> Exhibit:
-    """What is shown of a mesh and its data.
+    """Collect the contents of a view of a mesh and its data.
 
     Parameters
     ----------
     mesh : Mesh
         Tetrahedra, world mm (RAS+).
     cell_data : dict of arrays of M rows
-        By name, as `tetopt.load_mesh` returns them. Data of one number a cell are fields: those of whole numbers from
-        0 with up to `MOST_CATEGORIES` values are labels, all others quantities. Without any, the fields of
-        `tetopt.cell_fields` are taken.
+        By name, as `tetopt.load_mesh` returns them. Data with one number per cell are fields: whole numbers from 0
+        with up to `MOST_CATEGORIES` values are labels, all others are quantities. Without any, the fields of
+        `tetopt.cell_fields` are used.
     image : Image, optional
-        To be shown in the plane of the cut.
+        Shown in the plane of the cut.
     title : str
     facet_sets : dict of (K, 3) integer, optional
-        Triples of nodes to be highlighted, by name.
+        Triples of nodes to highlight, by name.
     point_data : dict of arrays of N rows or more, optional
-        By name; the first N rows are the mesh's nodes', what follows (the middles of quadratic cells' edges) is not
-        drawn. Data of one number a node are quantities. "displacement" (3 columns, mm) deforms the mesh, and its length
-        is a field; with "displacement_step2" and so on there are steps, and data with such an end are of that step.
+        By name; the first N rows belong to the mesh's nodes, later ones (mid-edge nodes of quadratic cells) are not
+        drawn. Data with one number per node are quantities. "displacement" (3 columns, mm) deforms the mesh, and its
+        length is a field; "displacement_step2" and so on define steps, and data with such a suffix belong to that step.
     reactions : dict, optional
-        By step, from 1, and facet set: the force that holds it, three numbers, mN.
+        Reaction by step, from 1, and facet set: three numbers, mN.
     table : LabelTable
         Names and colours of the labels in the data "label".
 
     Raises
     ------
     InputError
-        A mesh of triangles, a field of another length than there are cells, or of less than there are nodes, an image
-        that is not 3-D, a facet set that is not triples of the mesh's nodes.
+        The mesh has triangles; the length of a field is not the number of cells, or is less than the number of nodes;
+        the image is not 3-D; a facet set does not consist of triples of the mesh's nodes.
     """
     if mesh.ndim != 3:
         raise InputError(
-            "view: expected a mesh of tetrahedra, got one of triangles; open a plane mesh in a program such as ParaView"
+            "view: expected a tetrahedral mesh, got triangles; open 2-D meshes in another program, such as ParaView"
         )
     if image is not None and image.ndim != 3:
-        raise InputError(f"view: expected a 3-D image beside a mesh of tetrahedra, got a {image.ndim}-D one")
+        raise InputError(f"view: expected a 3-D image for a tetrahedral mesh, got a {image.ndim}-D one")
     for name, values in cell_data.items():
         if len(values) != len(mesh.cells):
             raise InputError(
@@ -134,32 +134,32 @@ def exhibit(
 
 
 def opened_on(shown: Exhibit, name: str | None = None, limits: tuple[float, float] | None = None) -> Exhibit:
-    """The exhibit with a field of this name as the first, in whose colours it opens, and these limits of its colours.
+    """Return the exhibit with the named field first, whose colours it opens with, and with these colour limits.
 
     Raises
     ------
     InputError
-        No field of that name; limits that are not apart, or of labels, which have a colour each.
+        No field has this name; the limits are not increasing, or are given for labels.
     """
     names = [field.name for field in shown.fields]
     if name is not None and name not in names:
-        raise InputError(f'field: the mesh has no "{name}"; it has {", ".join(dict.fromkeys(names))}')
+        raise InputError(f'field: the mesh has no field "{name}"; it has {", ".join(dict.fromkeys(names))}')
     fields = sorted(shown.fields, key=lambda field: field.name != (names[0] if name is None else name))
     if limits is not None:
         if not -np.inf < limits[0] < limits[1] < np.inf:
             raise InputError(f"range: expected LOW,HIGH with LOW below HIGH, got {limits[0]:g},{limits[1]:g}")
         if fields[0].categories:
-            raise InputError(f'range: "{fields[0].name}" are labels, which have a colour each; give a `field`')
+            raise InputError(f'range: "{fields[0].name}" has labels, which have fixed colours; give another `field`')
         first = fields[0].name
         fields = [field._replace(limits=limits) if field.name == first else field for field in fields]
     return shown._replace(fields=fields)
 
 
 def warp_factors(shown: Exhibit) -> tuple[float, float]:
-    """By what displacements are multiplied at first, so that they are seen (1 or more), and at most."""
+    """Return the initial factor of displacements, 1 or more, which makes them visible, and the largest factor."""
     largest = max((float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()), default=0.0)
     diagonal = float(np.sqrt((np.ptp(shown.mesh.points, axis=0) ** 2).sum()))
-    if largest <= ROUNDED_FRACTION * diagonal:  # it rests
+    if largest <= ROUNDED_FRACTION * diagonal:  # undeformed
         return 1.0, MOST_TIMES
     factor = SEEN_FRACTION * diagonal / largest
     power = 10.0 ** np.floor(np.log10(factor))
@@ -168,7 +168,7 @@ def warp_factors(shown: Exhibit) -> tuple[float, float]:
 
 
 def first_axis(shown: Exhibit) -> int:
-    """The axis across which the first cut is: it is then the largest or, of a deformed mesh, shows the most of it."""
+    """Return the axis of the first cut, which makes the section largest or shows most of a deformation."""
     if not shown.displacements:
         return int(np.argmin(np.ptp(shown.mesh.points, axis=0)))
     return int(np.argmin(np.abs(next(iter(shown.displacements.values()))).sum(axis=0)))
@@ -177,7 +177,7 @@ def first_axis(shown: Exhibit) -> int:
 def _nodal(
     mesh: Mesh, point_data: dict[str, NDArray]
 ) -> tuple[dict[str, NDArray], dict[int, NDArray[np.float64]], list[str]]:
-    """Numbers by name, the lengths of displacements first; displacements by step; the names of what is left."""
+    """Return numbers by name, lengths of displacements first; displacements by step; and the names of other data."""
     numbers: dict[str, NDArray] = {}
     displacements: dict[int, NDArray[np.float64]] = {}
     others = []
@@ -203,7 +203,7 @@ def _nodal(
 
 
 def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]]) -> list[Field]:
-    """The fields with the steps that they are of; those of a step without its number in the name."""
+    """Assign steps to fields, and remove the step number from their names."""
     if len(displacements) < 2:
         return fields
     matches = [STEP_NAME.fullmatch(field.name) for field in fields]
@@ -217,7 +217,7 @@ def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]])
 
 
 def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: LabelTable = NO_TABLE) -> Field:
-    """A field of the cells, or of the nodes with its mean over the corners of each cell."""
+    """Create a field of cells, or of nodes with its mean over the corners of each cell."""
     values, at_nodes = _single(values), None if nodes is None else _single(nodes)
     shown = values if at_nodes is None else at_nodes
     finite = shown[np.isfinite(shown)].astype(np.float64)
@@ -234,14 +234,14 @@ def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: Labe
 
 
 def _single(values: NDArray) -> NDArray[np.float32]:
-    """In single precision, NaN where a value is infinite."""
+    """Convert to single precision; infinite values become NaN."""
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
     return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
 def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[int, str]]:
-    """Labels and their colours; none if values are not whole, or negative, or too many for a list of colours."""
+    """Return labels and their colours; none if values are negative, not whole, or too many for a list of colours."""
     if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LARGEST_LABEL:
         return []
     labels = np.unique(values).astype(np.int64)
@@ -252,7 +252,7 @@ def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[in
 
 
 def _checked_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:
-    """The sets as arrays; InputError unless each is triples (K, 3) of the mesh's nodes."""
+    """Return the sets as arrays; InputError unless each consists of triples (K, 3) of the mesh's nodes."""
     sets = {name: np.asarray(nodes) for name, nodes in facet_sets.items()}
     last = len(mesh.points) - 1
     for name, nodes in sets.items():

@@ -1,6 +1,6 @@
-// The page: shows the mesh in #data cut by a plane, coloured by a field, within limits, beside its image. Places are in
-// mm relative to the middle of the mesh; only what is printed is in world coordinates. Runs after webgl.js,
-// explore_mesh.js and explore_gl.js in one scope.
+// The page: shows the mesh in #data cut by a plane, coloured by a field, within limits, with its image. Positions are mm
+// relative to the middle of the mesh; only printed ones are world coordinates. Runs after webgl.js, explore_mesh.js
+// and explore_gl.js in the same scope.
 
 const SIDES = ["RL", "AP", "SI"];  // at the upper and the lower end of each axis
 const FROM = { R: [0, 0], L: [2, 0], A: [1, 0], P: [-1, 0], S: [-1, 1], I: [-1, -1] };  // yaw and pitch, quarters
@@ -25,14 +25,14 @@ function start() {
   const gl = webgl(canvas);
   if (!gl) {
     canvas.remove();
-    say("This browser has no WebGL 2, so the mesh cannot be shown; try another browser or machine.");
+    say("This browser does not support WebGL 2, so the mesh cannot be shown; try another browser or machine.");
     return;
   }
   const notes = data.skipped.length
-    ? [`Neither one number a cell nor one a node, so not shown: ${data.skipped.join(", ")}.`] : [];
+    ? [`Not shown, as they are not one number per cell or node: ${data.skipped.join(", ")}.`] : [];
   const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (data.image && Math.max(...data.image.shape) > most) {
-    notes.push(`This machine's graphics take up to ${most} voxels along an axis, so the image is not shown.`);
+    notes.push(`This graphics card supports at most ${most} voxels along an axis, so the image is not shown.`);
     data.image = null;
   }
   explore(gl, data, notes);
@@ -64,11 +64,11 @@ function explore(gl, data, notes) {
   };
   const camera = { ...facing(), ...WHOLE };
   const isWithin = new Uint8Array(mesh.count).fill(1);
-  // The field by which labels are chosen, and those that are not shown.
+  // The field by which labels are selected, and the hidden labels.
   const labelling = fields.findIndex((field) => field.name === data.labelField && field.categories.length > 1);
   const hidden = new Set();
 
-  // From where the cut is seen at first, slantwise.
+  // The initial, oblique view of the cut.
   function facing() {
     const { axis, isTurned } = state;
     if (axis === 2) return { yaw: -1.2, pitch: isTurned ? -0.85 : 0.85 };
@@ -76,11 +76,11 @@ function explore(gl, data, notes) {
     return { yaw: isTurned && axis === 0 ? Math.PI - 0.6 : 0.6, pitch: 0.35 };
   }
 
-  // -- what is drawn
+  // -- drawing
 
-  const way = () => (state.isTurned ? -1 : 1);  // beyond the plane, along its axis, nothing is shown
+  const way = () => (state.isTurned ? -1 : 1);  // nothing is shown beyond the plane, along its axis
 
-  // The half space that is hidden: where the product of a place with the first three numbers is above the fourth.
+  // The hidden half space: positions whose product with the first three numbers is above the fourth.
   function plane() {
     if (state.axis < 0 || state.isWhole) return [0, 0, 0, 1];
     return [...[0, 1, 2].map((k) => (k === state.axis ? way() : 0)), way() * state.at];
@@ -88,7 +88,7 @@ function explore(gl, data, notes) {
 
   function within() {
     const { values, min, max } = fields[state.by];
-    const isAll = state.low <= min && state.high >= max;  // then cells without a value are shown, too
+    const isAll = state.low <= min && state.high >= max;  // then cells without a value are also shown
     const labels = hidden.size ? fields[labelling].values : null;
     let count = 0, volume = 0;
     for (let cell = 0; cell < mesh.count; cell++) {
@@ -115,11 +115,11 @@ function explore(gl, data, notes) {
     const levels = field.nodes && nodeLevels(field);
     const lines = labelling >= 0 && state.lines === "labels" ? fields[labelling].values : null;
     const outside = surface(mesh, shown(), levels);
-    // Where only the image is shown, the cells of the section are there as well, unseen, to be clicked on.
+    // If only the image is shown, the cells of the section are drawn invisibly, so that they can be clicked.
     const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at, levels, lines) : nothing;
     drawn.parts.surface.fill(outside);
     drawn.parts.section.fill(cut);
-    // Cells that are deformed take the image along: around them it would be where it was.
+    // Deformed cells deform the image; around them it would be undeformed.
     const isAlone = state.inside === "image" || !displacements.length || state.warp === 0;
     drawn.parts.slice.fill(hasSlice && isAlone ? slice(image.box, axis, at) : nothing);
     const isGlass = hidden.size && $("glass").checked;
@@ -286,7 +286,7 @@ function explore(gl, data, notes) {
     $("field").value = field;
     drawn.paint(fields[field].nodes ? null : cellColours(fields[field], table, hex(data.noValue)));
     showKey();
-    // Limits that leave nothing out go along with the field one looks at.
+    // Limits that exclude nothing follow the shown field.
     if (state.low <= min && state.high >= max) chooseBy(field);
     else build();
   }
@@ -305,7 +305,7 @@ function explore(gl, data, notes) {
     $("warped").textContent = state.warp ? `Deformation × ${number(state.warp)}` : "At rest";
   }
 
-  // The fields of the step, and those of none; what one looks at is followed from step to step.
+  // The fields of the step, and those without a step; the shown field is kept from step to step.
   function chooseStep(step) {
     const counterpart = (k) => {
       const same = fields.findIndex((field) => field.name === fields[k].name && [0, step].includes(field.step));
@@ -324,7 +324,7 @@ function explore(gl, data, notes) {
     showReaction();
   }
 
-  // Labels are shown or not; the first choice also colours the cells by them.
+  // Labels are shown or hidden; the first choice also colours the cells by them.
   function chooseLabels(isShown) {
     const { categories } = fields[labelling];
     for (const [value] of categories) {
@@ -360,7 +360,7 @@ function explore(gl, data, notes) {
   function showReaction() {
     const force = state.set < 0 ? null : (data.reactions[state.step] || {})[sets[state.set].name];
     const parts = force && force.map((value, k) => `${SIDES[k][0]} ${number(value, 4)}`).join(", ");
-    $("reaction").textContent = force ? `held by ${number(Math.hypot(...force), 4)} mN: ${parts}` : "";
+    $("reaction").textContent = force ? `reaction ${number(Math.hypot(...force), 4)} mN: ${parts}` : "";
   }
 
   function showCut() {
@@ -430,7 +430,7 @@ function explore(gl, data, notes) {
   const turn = turning(camera, redraw);
   const perPixel = () => 2 * radius / (camera.zoom * Math.min(canvas.clientWidth, canvas.clientHeight));
 
-  // About the pixel (x, y) from the view's middle, which stays where it is.
+  // Zoom about the pixel (x, y), relative to the view's middle, which stays in place.
   function zoom(factor, x = 0, y = 0) {
     const before = perPixel();
     camera.zoom = Math.max(0.3, Math.min(100, camera.zoom * factor));
@@ -456,7 +456,7 @@ function explore(gl, data, notes) {
     "0": () => look(facing()), PageUp: () => step(0.01), PageDown: () => step(-0.01),
   };
 
-  // -- all of it
+  // -- start
 
   function about() {
     const volume = mesh.volumes.reduce((sum, one) => sum + one, 0);
@@ -503,7 +503,7 @@ function explore(gl, data, notes) {
   $("controls").hidden = false;
 }
 
-// It begins after the first paint, so that the page says what it is doing: a large mesh takes seconds.
+// Starts after the first paint, so that the page shows its status: a large mesh takes seconds.
 setTimeout(() => {
   try {
     start();

@@ -1,6 +1,6 @@
-"""A page to explore a mesh with: cut it, colour it, pick cells out, beside its image; drawn by `explore*.js` in WebGL.
+"""A page to explore a mesh and its image: cut it, colour it, select cells; drawn by `explore*.js` in WebGL.
 
-One file without outside references, for someone who has nothing but a browser.
+A single file without external references, which needs only a browser.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Fi
 from tetopt.report.page import data_html, packed, policy_html, printed, rendered, script_html
 from tetopt.system.files import save_text
 
-PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
-PAGE_SIDE_VOXELS = 2048  # along an axis of it: what nearly every graphics card takes
+PAGE_IMAGE_VOXELS = 2**24  # 16 MB, one byte each: larger images are averaged
+PAGE_SIDE_VOXELS = 2048  # along an axis, which nearly all graphics cards support
 
 
 def colour_table() -> NDArray[np.uint8]:
-    """The colour map of quantities, (256, 3) red, green and blue."""
+    """Return the colour map of quantities, (256, 3) red, green and blue."""
     return np.rint(255.0 * matplotlib.colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
 
 
 def save_explorer(path: str | Path, shown: Exhibit) -> None:
     """Write `explorer_html` as one file, whole or not at all.
 
-    Replaces an existing file; ask `tetopt.system.files.checked_output` first.
+    Replaces an existing file; call `tetopt.system.files.checked_output` first.
     """
     save_text(path, explorer_html(shown))
 
 
 def explorer_html(shown: Exhibit) -> str:
-    """A page in which a mesh of tetrahedra is turned, cut, coloured by its fields and thresholded, beside its image.
+    """Return a page to turn, cut, colour and threshold a tetrahedral mesh, together with its image.
 
-    Everything is in the page, and it forbids itself all network access. A browser without WebGL 2 or scripts says so.
-    1 M cells take 24 MB of it, each field 5 MB more, the image 1.3 bytes a voxel. The image is in grey from its 0.5 to
-    its 99.5 percentile, each voxel where its affine puts it; above `PAGE_IMAGE_VOXELS` neighbours are averaged, which
-    the page says.
+    The page contains everything, and forbids itself all network access. It shows a message in a browser without WebGL 2
+    or scripts. 1 M cells take 24 MB, each field 5 MB, and the image 1.3 bytes per voxel. The image is drawn in grey
+    from its 0.5 to its 99.5 percentile, with each voxel placed by the affine; above `PAGE_IMAGE_VOXELS` neighbouring
+    voxels are averaged, and the page notes this.
     """
     mesh, fields, skipped, image, title, sets, displacements, n_nodes, reactions = shown
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
@@ -75,7 +75,7 @@ def _packed_field(field: Field) -> dict[str, Any]:
 
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
-    """The image as bytes, the first axis fastest, with what takes a place relative to `centre` to its index."""
+    """Pack the image as bytes, the first axis fastest, with the map from places relative to `centre` to indices."""
     shape = _shown_shape(image.shape)
     shown = image if shape == image.shape else averaged(image, shape)
     low, high = grey_limits([shown.data.astype(np.float64)])
@@ -88,14 +88,14 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
         "shape": shown.shape,
         "original": image.shape,
         "voxels": packed(greys.ravel(order="F"), "u1"),
-        "toIndex": to_index.T.ravel().tolist(),  # by columns, as WebGL takes it
+        "toIndex": to_index.T.ravel().tolist(),  # by columns, as WebGL expects
         "box": [world.min(axis=0).tolist(), world.max(axis=0).tolist()],
         "limits": [low, high],
     }
 
 
 def _shown_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The image's own shape or, if it is too large for the page, a coarser one: the longest axes are divided first."""
+    """Return the image's shape or, if that is too large for the page, a coarser one; the longest axes shrink first."""
     sizes = np.minimum(shape, PAGE_SIDE_VOXELS)
     longest = int(sizes.max())
     while np.prod(np.minimum(sizes, longest), dtype=np.int64) > PAGE_IMAGE_VOXELS:

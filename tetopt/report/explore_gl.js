@@ -1,4 +1,4 @@
-// Draws the mesh's parts in the colours of their cells or the image's greys, and says which cell is in a pixel.
+// Draws the mesh's parts in the colours of their cells or the image's greys, and finds the cell in a pixel.
 
 const NO_LEVEL = -1e6;  // of a node without a value
 const FRAGMENT = `${SHADING}
@@ -7,12 +7,12 @@ const FRAGMENT = `${SHADING}
   uniform bool isNodal; uniform vec3 noValue; uniform sampler2D table; uniform sampler2D colours;
   uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
   const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3, GLASS = 4;
-  vec4 grey(vec3 place) {  // of the voxel around a place; nothing outside of the image
+  vec4 grey(vec3 place) {  // of the voxel around a place; transparent outside the image
     vec3 index = (toIndex * vec4(place, 1.0)).xyz + 0.5;
     if (any(lessThan(index, vec3(0.0))) || any(greaterThanEqual(index, shape))) return vec4(0.0);
     return vec4(vec3(texelFetch(voxels, ivec3(index), 0).r), 1.0);
   }
-  vec3 atNodes() {  // the colour of a field that is interpolated
+  vec3 atNodes() {  // the colour of an interpolated field
     if (level < 0.1 * NO_LEVEL) return noValue;
     return texelFetch(table, ivec2(int(255.0 * clamp(level, 0.0, 1.0) + 0.5), 0), 0).rgb;
   }
@@ -34,22 +34,22 @@ const FRAGMENT = `${SHADING}
       colour = vec4(mix(vec3(1.0, 0.0, 0.75) * lit, vec3(0.35, 0.0, 0.25), 0.6 * line), 0.3);
       return;
     }
-    if (kind == GLASS) {  // of labels that are not shown
+    if (kind == GLASS) {  // of hidden labels
       colour = vec4(isNodal ? vec3(0.6) : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb, 0.14);
       colour.rgb *= lit;
       return;
     }
     vec3 own = isNodal ? atNodes() : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
-    vec4 below = kind == SECTION ? grey(rest) : vec4(0.0);  // the image is moved along
+    vec4 below = kind == SECTION ? grey(rest) : vec4(0.0);  // the image is deformed with the mesh
     float seenOwn = mix(1.0, fraction, below.a);
     vec3 fill = mix(below.rgb, own, seenOwn) * lit;
-    // Lines that show on any cell: dark, on dark cells light, over the image orange.
+    // Lines that are visible on any cell: dark, light on dark cells, orange over the image.
     vec3 ink = mix(vec3(0.5), vec3(0.05), smoothstep(0.1, 0.3, dot(fill, vec3(0.3, 0.6, 0.1))));
     ink = mix(vec3(1.0, 0.69, 0.0), ink, smoothstep(0.4, 0.6, seenOwn));
     if (cell + 1u == picked) fill = mix(fill, vec3(1.0, 0.1, 0.1), 0.7);
     colour = vec4(mix(fill, ink, mix(0.5, 0.65, seenOwn) * line), 1.0);
   }`;
-// The parts in the order in which they are drawn, with the shader's numbers of them.
+// The parts in the order of drawing, with their numbers in the shader.
 const KINDS = { surface: 0, section: 1, slice: 2, set: 3, glass: 4 };
 const WIDE = 2048;  // cells in a row of the texture of their colours
 
@@ -73,7 +73,7 @@ function cellColours(field, table, noValue) {
   return colours;
 }
 
-// Where the values of a field at the nodes lie between its limits, from 0 to 1.
+// The values of a field at the nodes relative to its limits, from 0 to 1.
 function nodeLevels(field) {
   const [low, high] = field.limits;
   return field.nodes.map((value) => (Number.isNaN(value) ? NO_LEVEL : (value - low) / (high - low)));
@@ -86,7 +86,7 @@ function nearestTexture(gl, unit, target) {
   for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(target, name, gl.NEAREST);
 }
 
-// What draws the view. It draws all of it for every change; only what `fill` and `paint` take stays on the card.
+// Draws the view. Every change redraws everything; only the data of `fill` and `paint` stay on the graphics card.
 function renderer(gl, image, radius, depth, table, noValue) {
   const { at, part, clear } = painter(gl, FRAGMENT);
   const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part(name === "section")]));
@@ -123,7 +123,7 @@ function renderer(gl, image, radius, depth, table, noValue) {
       gl.uniform1i(at("kind"), kind);
       parts[name].draw();
     }
-    // What of the set lies behind other cells shines through, and then all of the glass, over what is behind it.
+    // Hidden parts of the set shine through other cells; then all of the glass is drawn over the parts behind it.
     if (isPicking) return;
     gl.enable(gl.BLEND);
     gl.depthFunc(gl.GREATER);
@@ -140,7 +140,7 @@ function renderer(gl, image, radius, depth, table, noValue) {
   return {
     parts,
     frame,
-    // The colours of the cells, or null where they come from what their corners have.
+    // The colours of the cells, or null if they are interpolated from their corners.
     paint(colours) {
       gl.uniform1i(at("isNodal"), colours ? 0 : 1);
       if (!colours) return;

@@ -1,9 +1,9 @@
-// The mesh of the page: which cells touch, what its surface is and what a plane cuts. Places are in mm relative to its
-// middle, in single precision.
+// The mesh of the page: neighbours of cells, its surface and its sections. Positions are mm relative to its middle, in
+// single precision.
 
 const FACETS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];  // facet k of a cell lies opposite its node k
 
-// For each node of each cell the cell on the other side of the facet opposite, -1 on the boundary: (4 M).
+// For each node of each cell, the cell across the opposite facet, -1 on the boundary: (4 M).
 function neighbours(cells, nNodes) {
   const first = new Int32Array(nNodes).fill(-1);  // half facets, chained by their smallest node
   const next = new Int32Array(cells.length).fill(-1);
@@ -57,7 +57,7 @@ function extremes(values) {
   return [min, max];
 }
 
-// Its cells' values lie from `min` to `max`; what is drawn, which may be the nodes', from `least` to `most`.
+// The values of cells range from `min` to `max`; drawn values, which may be those of nodes, from `least` to `most`.
 function unpackedField(packed) {
   const values = new Float32Array(bytes(packed.values));
   const nodes = packed.nodes && new Float32Array(bytes(packed.nodes));
@@ -75,7 +75,7 @@ function boxOf(points) {
   return { low, high };
 }
 
-// The mesh at rest; `deform` moves its points, box and centroids, and leaves its volumes.
+// The undeformed mesh; `deform` moves its points, box and centroids, but keeps its volumes.
 function unpackedMesh(data) {
   const rest = new Float32Array(bytes(data.points));
   const cells = new Uint32Array(bytes(data.cells));
@@ -91,10 +91,10 @@ function deform(mesh, displacement, factor) {
   mesh.centroids = centroidsAndVolumes(mesh.points, mesh.cells).centroids;
 }
 
-// The farthest from the middle that a box reaches.
+// The largest distance of a box from the middle.
 const reach = ({ low, high }) => Math.hypot(...low.map((value, k) => Math.max(-value, high[k])));
 
-// The facets that exactly one shown cell has; with `levels`, one a node, the values at their corners.
+// The facets of exactly one shown cell; with `levels`, one per node, also the values at their corners.
 function surface(mesh, isShown, levels) {
   const { points, cells } = mesh;
   const isOuter = (half) => isShown[half >> 2] && !(mesh.neighbours[half] >= 0 && isShown[mesh.neighbours[half]]);
@@ -114,7 +114,7 @@ function surface(mesh, isShown, levels) {
   return triangles;
 }
 
-// The facets between cells of two labels neither of which is shown, as facets of the cell with the larger one.
+// The facets between cells of two hidden labels, as facets of the cell with the larger one.
 function interfaces(mesh, labels, isHidden) {
   const { points, cells } = mesh;
   const triangles = new Triangles(64);
@@ -127,8 +127,8 @@ function interfaces(mesh, labels, isHidden) {
   return triangles;
 }
 
-// The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles. With
-// `labels`, one a cell, only those of their sides are lines that lie between two labels, or on the boundary.
+// The sections of shown cells with the plane axis = at: triangles, or quadrilaterals in two triangles. With `labels`,
+// one per cell, only sides between two labels, or on the boundary, are lines.
 function section(mesh, isShown, axis, at, levels, labels) {
   const { points, rest, cells } = mesh;
   const triangles = new Triangles(64, true);
@@ -158,7 +158,7 @@ function section(mesh, isShown, axis, at, levels, labels) {
     const sides = (...nodes) => nodes.reduce((sum, node, k) => sum + (node < 0 ? 0 : isLine.get(node) << k), 0);
     if (up.length === 2) {
       const [a, b, c, d] = [[0, 0], [0, 1], [1, 1], [1, 0]].map(([i, j]) => between(up[i], down[j]));
-      triangles.add(cell, sides(down[0], -1, up[1]), a, b, c);  // the diagonal from a to c is no edge of the cell
+      triangles.add(cell, sides(down[0], -1, up[1]), a, b, c);  // the diagonal from a to c is not an edge of the cell
       triangles.add(cell, sides(up[0], down[1], -1), a, c, d);
     } else {
       const [alone, others] = up.length === 1 ? [up[0], down] : [down[0], up];
@@ -169,7 +169,7 @@ function section(mesh, isShown, axis, at, levels, labels) {
   return triangles;
 }
 
-// The rectangle of the plane over the image's box.
+// The rectangle of the plane that covers the image's box.
 function slice(box, axis, at) {
   const triangles = new Triangles(2);
   const [u, v] = [0, 1, 2].filter((k) => k !== axis);

@@ -33,19 +33,19 @@ from tetopt.system.files import check_suffix, written_whole
 
 matplotlib.use("agg")
 FIGURE_SUFFIXES = (".png",)
-# Grey before, then ColorBrewer's Dark2, which the colour-blind tell apart: of histograms and curves.
+# Colours of histograms and curves: grey, then ColorBrewer's Dark2, which the colour-blind can distinguish.
 CURVE_COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
-MESH_LINE = "#ffb000"  # orange: it shows on every grey
-MASK_LINE = "#1e90ff"  # blue: the colour-blind tell it from the orange
-DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels are still seen in 5 inches
-SLICE_WIDTH_INCHES = 4.2  # of the widest slice of a figure of several planes: two fill a page
-SLICES_HEIGHT_INCHES = 12.0  # of all its planes over each other, which one page can hold
-LETTER_INCHES = 0.075  # of a legend's texts, in 9 points
-NUMBER_RADIUS_FRACTION = 0.014  # of that width: the radius that a label's number takes in 5 points
+MESH_LINE = "#ffb000"  # orange, visible on every grey
+MASK_LINE = "#1e90ff"  # blue, which the colour-blind can distinguish from the orange
+DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels remain visible in 5 inches
+SLICE_WIDTH_INCHES = 4.2  # of the widest slice in a figure of several planes: two fill a page
+SLICES_HEIGHT_INCHES = 12.0  # of all its planes, one above the other, which fit on a page
+LETTER_INCHES = 0.075  # width of a letter in a legend, in 9 points
+NUMBER_RADIUS_FRACTION = 0.014  # of a slice's width: the radius of a label's number in 5 points
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
-    """Write a PNG, whole or not at all; InputError for a name that ends otherwise."""
+    """Write a PNG, whole or not at all; InputError for another suffix."""
     with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary:
         figure.savefig(temporary, dpi=dpi, format="png", bbox_inches="tight", facecolor="white")
 
@@ -54,10 +54,10 @@ def save_run_figures(
     paths: Sequence[Path], image: Image, initial: Mesh, result: MeshingResult, start: str = "lattice",
     whole: Image | None = None,
 ) -> None:  # fmt: skip
-    """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
+    """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
 
-    `paths` are theirs, and `start` is what the initial mesh is called. If `image` is continued beyond a mask, `whole`
-    is the one to show.
+    `paths` are their names, and `start` names the initial mesh. If `image` is extended beyond a mask, `whole` is the
+    image to show.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
@@ -73,11 +73,11 @@ def slice_figure(
     image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None,
     means_of: Image | None = None,
 ) -> Figure:  # fmt: skip
-    """A slice of the volume with each mesh cut through it, and below it the means that the cells stand for.
+    """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell.
 
-    `axis` and `index` choose the slice in voxel indices; by default it is across the axis nearest to the world's z (an
-    axial slice), at its middle. A 2-D image is shown whole. The means are those of `means_of`, by default of the image
-    itself. Where a mesh leaves the image uncovered, their row is light blue.
+    `axis` and `index` choose the slice in voxel indices; by default it is the middle slice across the axis nearest to
+    the world's z (an axial slice). A 2-D image is shown whole. The means are those of `means_of`, by default of the
+    image itself. In their row, parts of the image that a mesh does not cover are light blue.
     """
     view = SliceView(image, axis, index)
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
@@ -99,7 +99,7 @@ def slice_figure(
 
 def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
     """Draw the edges of a section's polygons over a slice."""
-    # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width, in points, would
+    # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width (in points) would
     # hide the image.
     width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))
     axes.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
@@ -108,8 +108,8 @@ def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
 def fill_cells(
     axes: Axes, polygons: NDArray[np.float64], values: NDArray[np.float64], colours: str, limits: tuple[float, float]
 ) -> PolyCollection:
-    """Fill a section's polygons with values (K,) in the colours of a map, and what they leave with light blue."""
-    # If they were antialiased, the background would shine through along each border as a light seam.
+    """Fill a section's polygons with values (K,) in the colours of a map, and the rest with light blue."""
+    # With antialiasing, the background would show along each border as a light seam.
     painted = PolyCollection(list(polygons), array=values, cmap=colours, edgecolors="none", antialiaseds=False)
     painted.set_clim(*limits)
     axes.set_facecolor(UNCOVERED_COLOUR)
@@ -124,7 +124,7 @@ def label_figure(
     image: Image | None = None,
     table: LabelTable = NO_TABLE,
 ) -> Figure:
-    """The labels of the voxels, and beside them those of the cells in the same colours, in three planes.
+    """Draw the labels of voxels and those of cells side by side, in the same colours and in three planes.
 
     Parameters
     ----------
@@ -132,24 +132,24 @@ def label_figure(
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) int64, optional
-        Each cell's label; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).
+        Label of each cell; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).
     image : Image, optional
-        On the labels' voxels. In a third column the interfaces of the cells' labels are drawn over it, each in the
-        colour of the label on its side that has fewer cells.
+        On the labels' voxels. A third column shows it with the interfaces of the cells' labels, each in the colour of
+        the adjacent label with fewer cells.
     table : LabelTable
         Names and colours of labels.
 
     Returns
     -------
     Figure
-        The axial, coronal and sagittal slices through the middle of the volume over each other, in one scale; a 2-D
-        image whole. The legend lists the labels that fill most of them; if it cannot list all, the numbers stand in
-        the voxels' picture as well, where there is room.
+        The axial, coronal and sagittal middle slices of the volume, one above the other and in one scale; a 2-D image
+        is shown whole. The legend lists the labels that cover most; if it cannot list all, numbers are also written
+        into the picture of the voxels where they fit.
 
     Raises
     ------
     InputError
-        As `tetopt.measure.fidelity.cell_labels`.
+        For the reasons of `tetopt.measure.fidelity.cell_labels`.
     """
     colours = label_colours(labels, table.colours)
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
@@ -158,7 +158,7 @@ def label_figure(
     cuts = [view.section(mesh) for view in views]
     shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
-    inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # a mm
+    inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # per mm
     handles, n_columns = legend_patches(colours, shown, table.names), 2 if image is None else 3
     beside = 1.1 + LETTER_INCHES * max(len(str(handle.get_label())) for handle in handles)
     figure = Figure(figsize=(n_columns * inches * width + beside, inches * sum(heights) + 0.6), layout="constrained")
@@ -185,7 +185,7 @@ def label_figure(
 def _draw_interfaces(
     column: Sequence[Axes], image: Image, mesh: Mesh, of_cell: NDArray[np.int64], colours: NDArray[np.float64]
 ) -> None:
-    """Draw the middle slices of the image, and over them where the interfaces of the cells' labels cut them."""
+    """Draw the middle slices of the image, and over them the sections of interfaces between the cells' labels."""
     views = _middle_views(image)
     limits = grey_limits([view.pixels for view in views], brightest=99.8)
     n_cells = np.bincount(of_cell, minlength=len(colours))
@@ -193,23 +193,23 @@ def _draw_interfaces(
         lines, sides = view.interfaces(mesh, of_cell)
         rarer = np.take_along_axis(sides, n_cells[sides].argmin(axis=1)[:, None], axis=1).ravel()
         view.show_pixels(axes, limits)
-        # Dark beneath, so that light colours show on white.
+        # A dark line beneath makes light colours visible on white.
         axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.6, capstyle="round"))
         axes.add_collection(LineCollection(list(lines), colors=colours[rarer], linewidths=1.1, capstyle="round"))
         view.frame(axes)
 
 
 def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
-    """How often each label 0 to n - 1 occurs in all arrays together."""
+    """Count the labels 0 to n - 1 in all arrays together."""
     return np.bincount(np.concatenate([array.ravel() for array in arrays]), minlength=n)
 
 
 def _write_numbers(
     axes: Axes, view: SliceView, pixels: NDArray[np.int64], colours: NDArray[np.float64], room: float
 ) -> None:
-    """Write the number of each label in the slice but 0 where it is widest, if a circle of `room` mm fits in there."""
+    """Write the number of each label except 0 at its widest place in the slice, if a circle of `room` mm fits there."""
     for label in np.unique(pixels[pixels > 0]):
-        # The transform measures to the nearest centre outside, which lies half a pixel behind the border.
+        # The transform measures the distance to the nearest outside centre, half a pixel beyond the border.
         depth = distance_transform_edt(np.pad(pixels == label, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
         deepest = np.unravel_index(depth.argmax(), depth.shape)
         if depth[deepest] >= room:
@@ -222,30 +222,30 @@ def _write_numbers(
 def boundary_figure(
     image: Image, mask: Image, mesh: Mesh, axis: int | None = None, index: int | None = None, word: str = "mask"
 ) -> Figure:
-    """The outline of a mask and the boundary of a mesh that follows it, over a slice and enlarged in a part of it.
+    """Draw the outline of a mask and the boundary of a mesh over a slice, and an enlarged detail of both.
 
     Parameters
     ----------
     image : Image
     mask : Image
-        From 0, outside, to 1, inside, on the image's voxels. Its outline is where it is 1/2, linear between the
-        voxels' centres.
+        From 0, outside, to 1, inside, on the image's voxels. Its outline is the level 1/2, interpolated linearly
+        between voxel centres.
     mesh : Mesh
-        Its boundary is drawn without what lies on the faces of the image's box.
+        Its boundary is drawn, except on the faces of the image's box.
     axis, index : int, optional
         The slice, in voxel indices; by default the axial one in the middle of the mask.
     word : str
-        What the legend calls the mask.
+        Name of the mask in the legend.
 
     Returns
     -------
     Figure
-        The slice, and the 25 voxels square of it in which the outline is longest, there with the cells' edges.
+        The slice, and the square of 25 voxels in it with the longest outline, with the cells' edges.
 
     Raises
     ------
     InputError
-        A mask of another shape than the image's.
+        The shape of the mask differs from the image's.
     """
     if mask.shape != image.shape:
         raise InputError(f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it")
@@ -262,7 +262,7 @@ def boundary_figure(
     for axes, width in ((whole, 0.7), (detail, 1.8)):
         view.show_pixels(axes, limits)
         view.frame(axes)
-        # The outline is wider, so that it shows on both sides where the boundary lies on it.
+        # The outline is wider, so that it remains visible on both sides of the boundary.
         axes.add_collection(LineCollection(list(outline), colors=MASK_LINE, linewidths=2.0 * width))
         axes.add_collection(LineCollection(list(boundary), colors=MESH_LINE, linewidths=width))
     polygons, _ = view.section(mesh)
@@ -277,7 +277,7 @@ def boundary_figure(
 
 
 def _half_level(view: SliceView) -> NDArray[np.float64]:
-    """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.measure.fidelity.half_level_surface`)."""
+    """Return the level 1/2 of the pixels as segments (K, 2, 2), picture mm; see `half_level_surface`."""
     affine = np.diag([*view.steps, 1.0])
     affine[:2, 2] = 0.5 * view.steps
     outline = half_level_surface(view.pixels, affine)
@@ -285,11 +285,11 @@ def _half_level(view: SliceView) -> NDArray[np.float64]:
 
 
 def _longest_part(outline: NDArray[np.float64], view: SliceView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most of the outline."""
+    """Return the corners, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most of the outline."""
     length = np.zeros(view.pixels.shape)
     pixel = (outline.mean(axis=1) / view.steps).astype(np.int64)
-    # Lengths are measured along the nearer axis, by which a straight line through the square counts the same however it
-    # runs, and only a bent one more.
+    # Lengths are measured along the nearer axis, so that straight lines through the square count the same in any
+    # direction, and only bent ones count more.
     np.add.at(length, tuple(pixel.T), np.abs(outline[:, 1] - outline[:, 0]).max(axis=1))
     side = np.minimum(DETAIL_VOXELS * view.steps.max(), view.size)
     around = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
@@ -299,7 +299,7 @@ def _longest_part(outline: NDArray[np.float64], view: SliceView) -> tuple[NDArra
 
 
 class SliceView:
-    """One slice of an image laid out for the eye: right, front and top of the patient on fixed sides."""
+    """One slice of an image in a standard orientation: right, front and top of the patient on fixed sides."""
 
     def __init__(self, image: Image, axis: int | None, index: int | None) -> None:
         self.image = image
@@ -322,11 +322,11 @@ class SliceView:
         self.aspect = self.size[1] / self.size[0]
 
     def show_pixels(self, axes: Axes, limits: tuple[float, float]) -> None:
-        """The pixels in grey, black and white at the `limits`."""
+        """Draw the pixels in grey, black and white at the `limits`."""
         axes.imshow(self.pixels.T, origin="lower", extent=self.extent, cmap="gray", vmin=limits[0], vmax=limits[1])
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their cells (K,)."""
+        """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their cells (K,)."""
         index = self.image.to_index(mesh.points)
         if self.across is None:
             corners, cells = index[mesh.cells], np.arange(len(mesh.cells))
@@ -335,7 +335,7 @@ class SliceView:
         return self._flat(corners), cells
 
     def boundary(self, mesh: Mesh) -> NDArray[np.float64]:
-        """Segments (K, 2, 2), in picture mm, of the mesh's boundary in the slice, off the faces of the image's box."""
+        """Return the mesh's boundary in the slice, off the image's box, as segments (K, 2, 2), picture mm."""
         index = self.image.to_index(mesh.points)
         outer, is_on_box = facets_on_box(mesh, self.image)
         if self.across is None:
@@ -343,7 +343,7 @@ class SliceView:
         return self._flat(triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
 
     def interfaces(self, mesh: Mesh, of_cell: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Segments (K, 2, 2), in picture mm, of the facets between cells of two labels, and these labels (K, 2)."""
+        """Return the interfaces between labels as segments (K, 2, 2), picture mm, and their two labels (K, 2)."""
         index, shared = self.image.to_index(mesh.points), facets(mesh.cells)
         is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
         nodes, sides = shared.nodes[is_between], of_cell[shared.cells[is_between]]
@@ -353,12 +353,12 @@ class SliceView:
         return self._flat(lines), sides[triangles]
 
     def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places in the picture (..., 2), mm, of index coordinates (..., n)."""
+        """Convert index coordinates (..., n) to positions in the picture (..., 2), mm."""
         flat = (index[..., self.axes] + 0.5) * self.steps
         return np.where(self.flip, self.size - flat, flat)
 
     def frame(self, axes: Axes) -> None:
-        """The whole slice in one scale, with the patient's sides as letters in place of ticks."""
+        """Frame the whole slice in one scale, with the patient's sides as letters instead of ticks."""
         axes.set_xlim(0.0, self.size[0])
         axes.set_ylim(0.0, self.size[1])
         axes.set_aspect("equal")
@@ -373,21 +373,21 @@ class SliceView:
 
 
 def _middle_views(image: Image) -> list[SliceView]:
-    """The axial, coronal and sagittal slice through the middle; a 2-D image whole."""
+    """Return the axial, coronal and sagittal middle slices; a 2-D image as a whole."""
     if image.ndim == 2:
         return [SliceView(image, None, None)]
     return [SliceView(image, world_axes(image.affine).index(world), None) for world in (2, 1, 0)]
 
 
 def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
-    """Normalised rho histograms of meshes over each other, as Fig. 1(d), with the paper's four errors."""
+    """Draw normalised rho histograms of meshes over each other, as in Fig. 1(d), with the paper's four errors."""
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
     for colour, (title, mesh) in zip(CURVE_COLOURS, meshes, strict=False):
         fraction, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
         shape = rho(mesh.points, mesh.cells)
-        n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # often too few for a bar to be seen
+        n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # often too few for a visible bar
         label = (
             f"{title}: mean {shape.mean():.3f}, {n_bad} bad cells; errors (i) {errors.mean:.4f}, "
             f"(ii) {errors.harmonic_mean:.4f}, (iii) {errors.l2:.4g}, (iv) {errors.worst:.4f}"
@@ -399,12 +399,12 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     axes.set_xlim(0.0, 1.0 / n * 1.02)
     axes.set_xlabel(f"rho = inradius / circumradius (1/{n} for a regular cell)")
     axes.set_ylabel("fraction of cells")
-    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # no bar can cross it there
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # where no bar can overlap it
     return figure
 
 
 def energy_figure(history: Sequence[IterationRecord]) -> Figure:
-    """E, E_G and E_D by iteration relative to the initial mesh, and the nodes' relative movement; Fig. 1(c)."""
+    """Draw E, E_G and E_D relative to the initial mesh, and the relative movement of nodes, by iteration; Fig. 1(c)."""
     figure = Figure(figsize=(7.5, 5.6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     iterations = [row.iteration for row in history]
@@ -421,10 +421,10 @@ def energy_figure(history: Sequence[IterationRecord]) -> Figure:
     top.set_ylim(bottom=0.0)
     top.legend(fontsize=9, frameon=False)
     if len(history) > 1:
-        movements = [max(row.movement, 1e-16) for row in history[1:]]  # above 0, which has no logarithm
+        movements = [max(row.movement, 1e-16) for row in history[1:]]  # above 0, for the logarithm
         bottom.semilogy(iterations[1:], movements, color="black", marker="o", markersize=3)
     bottom.set_ylabel("relative movement")
-    bottom.set_xlabel("iteration (shaded: connected anew)")
+    bottom.set_xlabel("iteration (shaded: reconnected)")
     bottom.set_xlim(-0.5, iterations[-1] + 0.5)
     bottom.xaxis.get_major_locator().set_params(integer=True)
     for row in history:

@@ -1,4 +1,4 @@
-"""A page of HTML in one file: sections, tables, pictures, data and scripts, without outside references."""
+"""HTML pages in a single file: sections, tables, pictures, data and scripts, without external references."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from tetopt.io.text import plain
 from tetopt.system.files import save_text
 
-# Of pages: the files beside this one that each is made of.
+# The script files, beside this one, of each page.
 PAGE_SCRIPTS = {
     "viewer": ("webgl.js", "viewer.js"),
     "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),
     "cohort": ("cohort.js",),
 }
-BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a readable width on a phone, and scrolls.
+BROAD_RATIO = 1.4  # width over height beyond which a picture keeps a readable width on a phone, and scrolls
 
 
 @cache
@@ -41,7 +41,7 @@ def package_text(name: str) -> str:
 
 
 def rendered(template: str, **values: Any) -> Markup:
-    """Markup of a template in the package; all values but markup are escaped.
+    """Render a template in the package; all values except markup are escaped.
 
     See https://jinja.palletsprojects.com/ for the language of the templates.
     """
@@ -51,8 +51,8 @@ def rendered(template: str, **values: Any) -> Markup:
 def write_page(path: Path, title: str, content: str, style: str = "") -> None:
     """Write markup under a heading as one HTML file, whole or not at all.
 
-    `content` and `style` (CSS after the page's own) go in as they are, but for what is not printed, such as marks that
-    turn the direction of writing, which is shown as Python escapes it; `title` is text. See `policy_html`.
+    `content` and `style` (CSS after the page's own) are inserted unchanged, except for unprintable characters, such as
+    marks that reverse the direction of writing, which are shown as Python escapes; `title` is text. See `policy_html`.
     """
     page = rendered(
         "report/page.html", policy=policy_html(), title=plain(title), style=Markup(style), content=Markup(content)
@@ -61,9 +61,9 @@ def write_page(path: Path, title: str, content: str, style: str = "") -> None:
 
 
 def picture_html(path: str | Path, caption: str) -> Markup:
-    """Markup of a PNG, embedded, with its caption as text and as what a screen reader says."""
+    """Embed a PNG as markup, with its caption as text and as alternative text for screen readers."""
     png = Path(path).read_bytes()
-    width, height = struct.unpack(">II", png[16:24])  # of the IHDR chunk, which is always the first
+    width, height = struct.unpack(">II", png[16:24])  # in the IHDR chunk, which always comes first
     data = base64.b64encode(png).decode("ascii")
     shape = "wide broad" if width > BROAD_RATIO * height else "wide"
     return Markup(
@@ -73,19 +73,19 @@ def picture_html(path: str | Path, caption: str) -> Markup:
 
 
 def packed(numbers: NDArray, kind: str) -> str:
-    """Base64 of an array's bytes, as numbers of a `kind` such as "<f4"."""
+    """Encode an array as Base64, as numbers of a `kind` such as "<f4"."""
     return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
 
 
 def data_html(name: str, data: Any) -> Markup:
-    """Markup of data for a script, as JSON in the element `name`."""
-    # An HTML parser ends a script at "</script" wherever it stands, also in a string.
+    """Return data for a script as markup: JSON in the element `name`."""
+    # An HTML parser ends a script at any "</script", even within a string.
     text = json.dumps(_shown(data), allow_nan=False).replace("<", "\\u003c")
     return Markup(f'<script type="application/json" id="{name}">{text}</script>')
 
 
 def _shown(data: Any) -> Any:
-    """The data with all its texts `plain`: a page shows names as they are."""
+    """Make all texts in the data `plain`: a page shows names literally."""
     if isinstance(data, dict):
         return {plain(str(key)): _shown(value) for key, value in data.items()}
     if isinstance(data, list | tuple):
@@ -94,21 +94,21 @@ def _shown(data: Any) -> Any:
 
 
 def script_html(name: str) -> Markup:
-    """Markup of one of `PAGE_SCRIPTS`."""
+    """Return one of `PAGE_SCRIPTS` as markup."""
     return Markup(f"<script>{_script(name)}</script>")
 
 
 @cache
 def _script(name: str) -> str:
-    """A script in a scope of its own: files beside this one, one after the other."""
+    """Return a script, concatenated from its files, in its own scope."""
     texts = [package_text(f"report/{part}") for part in PAGE_SCRIPTS[name]]
     return "\n".join(["", '"use strict";', "(() => {", *texts, "})();", ""])
 
 
 def policy_html() -> Markup:
-    """Markup by which a page forbids itself the network, forms, and all scripts but our own.
+    """Return the markup by which a page forbids itself the network, forms, and all scripts except tetopt's.
 
-    What slipped in with a name neither runs nor is fetched: scripts are let in by the hash of their text.
+    Scripts are allowed by the hash of their text, so that code injected through a name is neither run nor fetched.
     W3C, Content Security Policy Level 3, https://www.w3.org/TR/CSP3/, 6.7.3 and 8.3.
     """
     digests = (hashlib.sha256(_script(name).encode()).digest() for name in PAGE_SCRIPTS)
@@ -119,5 +119,5 @@ def policy_html() -> Markup:
 
 
 def printed(markup: str) -> str:
-    """Markup in which all that is not printed, but line breaks, is shown as Python escapes it."""
+    """Replace unprintable characters in markup, except line breaks, by Python escapes."""
     return "\n".join(map(plain, markup.split("\n")))

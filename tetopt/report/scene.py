@@ -1,4 +1,4 @@
-"""Pictures in three dimensions, rendered off screen by pyvista."""
+"""3-D pictures, rendered off screen by pyvista."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
 from tetopt.report.viewer import View
 from tetopt.system.files import check_suffix, written_whole
 
-STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
-SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
-GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell them, and the voxels show through
+STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices behind it
+SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right, in front and above
+GLASS_OPACITY = 0.35  # of the cells' colours over the image: colours are distinct, and voxels remain visible
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
 def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
-    """PNG of scenes side by side, each with a title, seen from the same side; in rows of `columns`, or in one row.
+    """Write a PNG of scenes with titles, seen from the same side, in one row or in rows of `columns`.
 
-    A scene is a function that adds its parts to a plotter, such as `structure_before_slices` returns.
+    A scene is a function that adds its parts to a plotter, such as the result of `structure_before_slices`.
     """
-    # Without a display VTK complains of the missing one before it renders off screen.
+    # Without a display, VTK issues a warning before it renders off screen.
     with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary, pyvista.vtk_verbosity("off"):
         columns = min(columns or len(scenes), len(scenes))
         rows = -(-len(scenes) // columns)
@@ -50,20 +50,20 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
 
 
 def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
-    """Put a scene into the plotter's present part, and the camera to where all scenes are seen from."""
+    """Draw a scene in the plotter's current part, and move the camera to the viewpoint of all scenes."""
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(1.05)
 
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
-    """The boundary of the chosen cells in front of the volume's middle slices, drawn on the box's far sides."""
+    """Return a scene of the boundary of chosen cells in front of the volume's middle slices, on the box's far sides."""
     surface = pyvista.PolyData.from_regular_faces(mesh.points, boundary_facets(mesh.cells[chosen]))
     return _before_slices(image, surface, show_edges=True, edge_color="#402000", line_width=1)
 
 
 def isosurface_before_slices(image: Image, surface: pyvista.PolyData) -> Draw:
-    """A surface taken from the voxels in front of the same slices."""
+    """Return a scene of an isosurface of the voxels in front of the same slices."""
     return _before_slices(image, surface, smooth_shading=True)
 
 
@@ -76,7 +76,7 @@ def _before_slices(image: Image, surface: pyvista.PolyData, **look: Any) -> Draw
 
 
 def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
-    """The volume's middle slices where they belong, and the edges of the cells under the level one."""
+    """Return a scene of the volume's middle slices in place, with the edges of cells below the horizontal one."""
     middle = image.to_world((np.array(image.shape) - 1.0) / 2.0)
 
     def draw(plotter: pyvista.Plotter) -> None:
@@ -89,8 +89,8 @@ def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
 
 
 def cutaway(view: View, limits: tuple[float, float]) -> Draw:
-    """The surface of an opened mesh, each cell in the grey of its value between `limits`, with the cells' edges."""
-    # The darkest is not quite black, on which no light would show how a facet lies.
+    """Return a scene of the surface of an opened mesh, shaded by cell values between `limits`, with edges."""
+    # The darkest grey is not quite black, so that light still shows the orientation of a facet.
     shown = (limits[0] - 0.25 * (limits[1] - limits[0]), limits[1])
     surface = pyvista.PolyData.from_regular_faces(view.points, view.triangles)
     surface.cell_data["h"] = view.values
@@ -101,9 +101,9 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
 
 
 def opened_mesh(shown: Exhibit) -> Draw:
-    """The mesh as `tetopt view` opens it: cut across its middle, in the colours of its first field, beside the image.
+    """Return the initial scene of `tetopt view`: the mesh cut across its middle, coloured by its first field.
 
-    A mesh with displacements is drawn deformed, without the image, which is at rest.
+    The image is drawn in the cut. A mesh with displacements is drawn deformed, without the undeformed image.
     """
     field, (factor, _) = shown.fields[0], warp_factors(shown)
     u = next(iter(shown.displacements.values()), None)
@@ -123,7 +123,7 @@ def opened_mesh(shown: Exhibit) -> Draw:
         look |= {"cmap": COLOUR_MAP, "clim": field.limits, "nan_color": NO_VALUE}
 
     def draw(plotter: pyvista.Plotter) -> None:
-        plotter.enable_parallel_projection()  # which has all of it in the picture
+        plotter.enable_parallel_projection()  # keeps all of it in the picture
         plane = {"normal": np.eye(3)[axis], "origin": middle}
         behind, section = grid.extract_surface(algorithm="dataset_surface").clip(**plane), grid.slice(**plane)
         if behind.n_cells:
@@ -141,7 +141,7 @@ def opened_mesh(shown: Exhibit) -> Draw:
 
 
 def _label_colours(field: Field) -> NDArray[np.uint8]:
-    """Red, green and blue of each cell's label (M, 3); `NO_VALUE` for values that are no label."""
+    """Return the red, green and blue of each cell's label (M, 3); `NO_VALUE` for values that are not labels."""
     colours = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(field.values), 1))
     for label, colour in field.categories:
         colours[field.values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
@@ -149,7 +149,7 @@ def _label_colours(field: Field) -> NDArray[np.uint8]:
 
 
 def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
-    """What the colours stand for; of labels those that most cells have."""
+    """Add a colour bar, or a legend of the labels with most cells."""
     title = plain_text(f"{field.name} ({field.unit})" if field.unit else field.name)
     if not field.categories:
         mapper = pyvista.DataSetMapper()
@@ -169,16 +169,16 @@ def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
 
 
 def plane_slice(image: Image, axis: int, at: float) -> pyvista.PolyData:
-    """The image in a world plane: a polygon for each voxel that the plane cuts.
+    """Return the image in a world plane: a polygon for each voxel that the plane cuts.
 
     Parameters
     ----------
     image : Image
         Three-dimensional.
     axis : int
-        World axis across the plane, 0 for R-L, 1 for A-P, 2 for S-I.
+        World axis normal to the plane, 0 for R-L, 1 for A-P, 2 for S-I.
     at : float
-        Where the plane crosses it, mm.
+        Position of the plane on this axis, mm.
 
     Returns
     -------
@@ -187,17 +187,17 @@ def plane_slice(image: Image, axis: int, at: float) -> pyvista.PolyData:
     """
     voxels = pyvista.ImageData(dimensions=np.array(image.shape) + 1, origin=(-0.5, -0.5, -0.5))
     voxels.cell_data["h"] = image.data.ravel(order="F")
-    # The index of a place in the plane; between two layers of voxels the upper is shown.
+    # The index of a point in the plane; halfway between two layers of voxels the upper one is shown.
     inside = np.linalg.inv(image.affine[:3, :3])[:, axis] * (at - image.affine[axis, 3]) + 1e-6
     return voxels.slice(normal=image.affine[axis, :3], origin=inside).transform(image.affine, inplace=False)
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:
-    """Surface at level `below` of the dark structures that lie in the mask `near`, world mm.
+    """Return the surface at level `below` of the dark structures within the mask `near`, world mm.
 
-    Voxels under the level are eroded by one voxel, which parts the ventricles from the sulci. The piece with most
-    voxels in `near` and those with a tenth of that are grown back, and marching cubes run on the intensities of the
-    voxels in and next to them. Without such pieces: no points.
+    Voxels below the level are eroded by one voxel, which separates the ventricles from the sulci. The connected
+    component with most voxels in `near`, and those with at least a tenth of that, are dilated again, and marching cubes
+    run on the intensities of the voxels in and next to them. Without such components the surface has no points.
     """
     is_dark = image.data < below
     pieces, _ = ndimage.label(ndimage.binary_erosion(is_dark))
@@ -211,7 +211,7 @@ def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) 
 
 
 def _far_side(image: Image, axis: int) -> float:
-    """The index along one axis at which the box's side lies that is farther from the eye."""
+    """Return the index along one axis of the box's side that is farther from the camera."""
     outward = image.affine[:3, axis] @ np.asarray(SCENE_VIEWPOINT)
     return -0.5 if outward > 0.0 else image.shape[axis] - 0.5
 
@@ -226,7 +226,7 @@ def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float])
 
 
 def _slice_sheet(image: Image, axis: int, at: float) -> pyvista.StructuredGrid:
-    """The middle slice across an index axis, placed at index `at` of that axis, in world mm, one facet a pixel."""
+    """Return the middle slice across an index axis, moved to index `at`, in world mm, with one facet per pixel."""
     pixels = np.take(image.data, image.shape[axis] // 2, axis=axis)
     corners = [np.arange(s + 1) - 0.5 for s in image.shape]
     corners[axis] = np.array([at])

@@ -1,4 +1,4 @@
-"""A run in numbers: what `tetopt mesh --json` writes."""
+"""The numbers of a run, as written by `tetopt mesh --json`."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 
 
 def versions() -> dict[str, str]:
-    """Versions of tetopt, Python and the libraries that the numbers rest on."""
+    """Return the versions of tetopt, Python and the libraries that affect the numbers."""
     ours = {"tetopt": version("tetopt"), "python": platform.python_version()}
     return ours | {name: version(name) for name in SHOWN_VERSIONS}
 
 
 def mesh_hash(mesh: Mesh) -> str:
-    """SHA-256 over the bytes of points, cells and midpoints, if any: equal for meshes of the same bits."""
+    """Return the SHA-256 of points, cells and midpoints, if any: equal for bitwise identical meshes."""
     digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
     digest.update(np.ascontiguousarray(mesh.cells).tobytes())
     if mesh.midpoints is not None:
@@ -47,7 +47,7 @@ def mesh_hash(mesh: Mesh) -> str:
 
 
 def image_summary(image: Image | Content) -> dict[str, Any]:
-    """Shape, place and spread of an image; `total_variation` is E_D of one cell around everything."""
+    """Return shape, position and spread of an image; `total_variation` is E_D of a single cell around it."""
     grid, (mean, low, high, variance) = plain(image).image, plain(image).spread
     return {
         "shape": grid.shape,
@@ -65,9 +65,9 @@ def run_summary(
     image: Image | Content, initial: Mesh, result: MeshingResult, about: dict[str, Any],
     seconds: dict[str, float], shapes: tuple[Quality | None, Quality | None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.
+    """Return all numbers of a run: options and file (`about`), versions, energies by iteration, quality (both meshes).
 
-    `shapes` are those qualities, if they were measured before; None for one that could not be.
+    `shapes` are these qualities, if already measured; None for one that could not be measured.
     """
     if shapes is None:
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
@@ -99,13 +99,13 @@ def run_summary(
 
 
 def size_summary(mesh: Mesh, order: int) -> dict[str, Any]:
-    """How many nodes a mesh has, and how many with those of order 2 ("n_nodes_in_all"), and how many cells."""
+    """Return the numbers of nodes, of nodes including those of order 2 ("n_nodes_in_all"), and of cells of a mesh."""
     n_nodes = node_count(mesh.points, mesh.cells, order)
     return {"order": order, "n_nodes": len(mesh.points), "n_nodes_in_all": n_nodes, "n_cells": len(mesh.cells)}
 
 
 def model_summary(model: Model) -> dict[str, Any]:
-    """How large mesh and sets are, and what the cells are made of, moduli in kPa."""
+    """Return the sizes of mesh and sets, and the materials of cells, moduli in kPa."""
     of_facets = {name: len(rows) for name, rows in model.sets.facets.items()}
     of_cells = {name: len(cells) for name, cells in model.sets.cells.items()}
     summary: dict[str, Any] = {
@@ -126,13 +126,13 @@ def fidelity(
     labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None,
     what: Content | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """How well a mesh represents a mask and labels.
+    """Measure how well a mesh represents a mask and labels.
 
-    A `MaskFidelity` in `mask`, and for each label a `LabelFidelity` in `labels` and a `LabelInterface` in `interfaces`;
-    of each two labels a `LabelContact` in `contacts`, their sums in `contact_totals`.
-    Each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
-    as well, is left out of the first two. `of_cell` (M,) is each cell's label, by default that of most of its voxels;
-    `failed` as of `measured_each`; `what` is of these labels and this mask, where their levels are known.
+    Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a `LabelInterface` in
+    `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and their sums in `contact_totals`.
+    Entries of missing images are omitted. With a mask, labels count only inside it, and label 0, which also stands for
+    the outside, is omitted from the first two. `of_cell` (M,) is the label of each cell, by default that of most of its
+    voxels; for `failed` see `measured_each`; `what` is the content with the levels of these labels, if known.
     """
     measures: dict[str, Callable[[], Any]] = {}
     if mask is not None:
@@ -166,14 +166,14 @@ def fidelity(
 
 
 def _with_levels(what: Content | None, labels: Image, mask: Image | None) -> Content:
-    """The content if it has levels of labels, or else one of the labels alone that has them."""
+    """Return the content if it has levels of labels, or else create one of the labels alone with levels."""
     return what if what is not None and what.memberships is not None else content(labels, labels, mask)
 
 
 def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:
-    """Take measures, several at the same time; what each returns, by name.
+    """Compute measures in parallel; return their results by name.
 
-    With `failed`, a measure that raises anything is left out and its reason noted there, so that the others are taken.
+    With `failed`, a measure that raises an error is omitted and its reason is noted there, so that the others complete.
     """
     measured = {}
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:

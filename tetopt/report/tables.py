@@ -18,14 +18,14 @@ from tetopt.measure.thin import TOLERATED_CONTACT, LabelContact
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
 
-CHANGED_FRACTION = 0.2  # of a label's size: what cells have more or less is said in words
-WORST_ROWS = 5  # of labels and of pairs that are shown; run.json has all
+CHANGED_FRACTION = 0.2  # of a label's size: larger changes get a line of text
+WORST_ROWS = 5  # labels and pairs shown; run.json has all
 TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
-LARGE_SIZE = 1e4  # mm3 or mm2: of a label so large its tenths are not shown
+LARGE_SIZE = 1e4  # mm3 or mm2: larger labels are shown without decimals
 
 
 def new_table(*columns: str) -> Table:
-    """A table with these heads: names to the left, numbers to the right."""
+    """Create a table with these headers: names left-aligned, numbers right-aligned."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right")
@@ -33,20 +33,20 @@ def new_table(*columns: str) -> Table:
 
 
 def size_words(ndim: int) -> str:
-    """What the size of something is called, and its unit."""
+    """Return the name of a size, with its unit."""
     return "volume, mm3" if ndim == 3 else "area, mm2"
 
 
 def nodes_in_words(mesh: Mesh, order: int) -> str:
-    """How many nodes a mesh has: "4864 nodes", or of order 2 "716 corner nodes, 5012 in all"."""
+    """Describe the number of nodes of a mesh: "4864 nodes", or for order 2 "716 corner nodes, 5012 in all"."""
     if order == 1:
         return f"{len(mesh.points)} nodes"
     return f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, order)} in all"
 
 
 def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None) -> None:
-    """Rows of the shape of one or several meshes, a column each; `in_all` are their nodes where cells are quadratic,
-    `jacobian` the smallest scaled Jacobian determinant of curved ones."""
+    """Add rows on the shape of one or more meshes, one column each; `in_all` are the numbers of nodes of quadratic
+    meshes, `jacobian` is the smallest scaled Jacobian determinant of curved cells."""
     corners = [str(q.n_nodes) for q in meshes]
     table.add_row("corner nodes" if in_all else "nodes", *corners)
     if in_all:
@@ -75,7 +75,7 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jaco
 
 
 def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
-    """How well a mesh of so many dimensions fills its mask, which the table calls `word`."""
+    """Return a table of how well a mesh fills its mask, which the table calls `word`."""
     table = new_table(word, "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
     table.add_row(size_words(ndim), f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
@@ -87,8 +87,8 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
          mask.reverse_p95_mm),
     ):  # fmt: skip
         mean, p95, mean_mm, p95_mm = (f"{distance:.3f}" for distance in distances)
-        is_there = not np.isnan(distances).any()  # both surfaces are, off the faces of the box
-        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one of them is not there", "")
+        is_there = not np.isnan(distances).any()  # both surfaces exist off the faces of the box
+        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one of them is missing", "")
         table.add_row(title, *shown)
     table.add_row("connected components", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
@@ -96,29 +96,29 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
 
 
 def sizes_in_words(edges: EdgeRatios) -> str:
-    """How the edges of a mesh meet their targets, and why they do not, in one line."""
+    """Describe how well the edges of a mesh match their target sizes, in one line."""
     return (
-        f"edges over their target size: {edges.mean:.2f} in the mean; {edges.below:.1%} under "
+        f"ratio of edges to their target size: {edges.mean:.2f} on average; {edges.below:.1%} are below "
         f"{SHORT_EDGE_FRACTION:.2f}, "
-        f"where the image asks for smaller cells; {edges.above:.1%} over {LONG_EDGE:.2f}"
+        f"where the image needs smaller cells; {edges.above:.1%} are above {LONG_EDGE:.2f}"
     )
 
 
 def curving_in_words(curving: Curving) -> str:
-    """How many edges on interfaces and on a mask's surface are curved, in one line."""
+    """Describe the curved edges on interfaces and on a mask's surface, in one line."""
     return (
-        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node there, "
-        f"{curving.n_part_way} go part of the way and {curving.n_straight} are straight; up to "
-        f"{curving.farthest:.2g} mm off the straight edge, scaled Jacobian at least {curving.least_jacobian:.2f}"
+        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node on the surface, "
+        f"{curving.n_part_way} are partly curved and {curving.n_straight} are straight; largest offset "
+        f"{curving.farthest:.2g} mm from the straight edge, scaled Jacobian at least {curving.least_jacobian:.2f}"
     )
 
 
 def label_table(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str], ndim: int
 ) -> Table:
-    """How well a mesh of so many dimensions represents labels, and what their surfaces are like.
+    """Return a table of how well a mesh represents labels, and of the smoothness and topology of their surfaces.
 
-    There is a row for each, with its name if any. "larger by" is of its cells beside its voxels.
+    Each label has a row, with its name if any. "larger by" compares its cells with its voxels.
     """
     table = new_table(
         "label", "voxels", size_words(ndim), "cells", "larger by, %", "Dice", "Dice by volume", "distance, mm", "95 %",
@@ -143,9 +143,9 @@ def _decimals(number: float, count: int) -> str:
 
 
 def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
-    """The labels of which most is one cell thick, at most `WORST_ROWS`, worst first, of equal ones the thinnest.
+    """Return a table of the `WORST_ROWS` labels with the largest one-layer fraction, worst first, then thinnest.
 
-    Label 0 is no tissue, and left out.
+    Label 0 is not a tissue and is omitted.
     """
     table = new_table(
         "thin labels", "in one layer, %", "voxels, mm: 5 %", "50 %", "95 %", "cells, mm: 5 %", "50 %", "95 %"
@@ -162,7 +162,7 @@ def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table
 
 
 def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], ndim: int) -> Table | None:
-    """Pairs that touch over 1.5 times as much as in the voxels, those by most first; None if there are none."""
+    """Return a table of pairs with over 1.5 times the contact of the voxels, largest excess first; None if empty."""
     more = [each for each in contacts if each.mesh_mm2 > TOLD_CONTACT * each.voxels_mm2]
     if not more:
         return None
@@ -176,10 +176,10 @@ def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], nd
 
 
 def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
-    """How much labels touch that should not, in one line."""
+    """Describe the excess contact between labels, in one line."""
     unit = "mm2" if ndim == 3 else "mm"
     return (
-        f"contact over {TOLERATED_CONTACT:g} times the voxels': {totals['excess_mm2']:.1f} {unit}, of which "
+        f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: {totals['excess_mm2']:.1f} {unit}, including "
         f"{totals['false_mm2']:.1f} {unit} between labels that do not touch in the voxels"
     )
 
@@ -195,14 +195,14 @@ def _label_words(label: int, names: Mapping[int, str]) -> str:
 def label_differences(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> list[str]:
-    """Where cells hang together otherwise than the voxels of their label, or are far fewer: a line for each label."""
+    """Describe labels whose cells differ from their voxels in topology, or strongly in size: one line per label."""
     lines = []
     for row, surface in zip(rows, interfaces, strict=True):
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = row.components + cavities - surface.euler // 2
         parts, more = [], row.mesh_volume - row.volume
         if abs(more) > CHANGED_FRACTION * row.volume:
-            parts.append(f"{abs(more) / row.volume:.0%} of its size {'lost' if more < 0.0 else 'more'}")
+            parts.append(f"{abs(more) / row.volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
         if row.components != row.mesh_components:
             parts.append(f"{_number_of(row.components, 'component')} of voxels, {row.mesh_components} of cells")
         parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")
@@ -214,7 +214,7 @@ def label_differences(
 
 
 def _surplus(count: int, noun: str) -> list[str]:
-    """Of cells over voxels, in words, if there is any."""
+    """Describe a surplus of cells over voxels; empty if there is none."""
     return [f"{_number_of(abs(count), noun)} {'more' if count > 0 else 'fewer'}"] if count else []
 
 

@@ -1,7 +1,7 @@
-"""A picture of a few kB by which one of hundreds of subjects is judged at a glance: two slices in the world's axes.
+"""A picture of a few kB to judge one of hundreds of subjects at a glance: two slices along the world's axes.
 
-Slices are across the world's axes, not the voxels': an image whose affine is wrong lies wrongly in it, whatever the
-order of its voxels is, and one that is oblique is turned.
+Slices follow the world's axes, not those of the voxels: a wrong affine is visible, whatever the order of the voxels,
+and an oblique image appears rotated.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
 from tetopt.system.files import check_suffix, save_bytes
 
-SIDE_PIXELS = 128  # of a view: a head is seen, a page has 500 of them
-SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would flicker in single samples
-MARGIN_FRACTION = 0.08  # of the mesh's largest side, left around it on each side
-SLAB_COUNT = 20  # across the mesh, of which the fullest is where it is cut, if its middle is emptier than half of that
-PALETTE_COLOURS = 32  # greys and oranges, as the eye needs them: half of the bytes of 256
-EDGE_POINTS = 4.0  # width of edges times the root of how many cells are cut: however many, they tint the image alike
-LABEL_ALPHA = 0.45  # of cells' labels over the image
+SIDE_PIXELS = 128  # of a view: enough for a head, where a page has 500 of them
+SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would cause aliasing with single samples
+MARGIN_FRACTION = 0.08  # of the mesh's largest side, on each side of it
+SLAB_COUNT = 20  # slabs across the mesh: it is cut in the fullest if its middle has less than half as much
+PALETTE_COLOURS = 32  # greys and oranges, enough for the eye: half of the bytes of 256
+EDGE_POINTS = 4.0  # width of edges times the root of the number of cut cells: a constant tint for any number
+LABEL_ALPHA = 0.45  # opacity of the cells' labels over the image
 SIDE_LETTERS = ("LR", "PA")  # at the left and the right of a view along this world axis
-LETTER_POINTS = 4.5  # 8 pixels: the smallest that is read
+LETTER_POINTS = 4.5  # 8 pixels, the smallest readable size
 VIEW_AXES = {
     3: ((0, 1), (1, 2)),
     2: ((0, 1),),
-}  # horizontal and vertical world axes: axial and sagittal; a 2-D image whole
+}  # horizontal and vertical world axes: axial and sagittal views; a single view in 2-D
 
 
 def save_thumbnail(
     path: Path, image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
     of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
 ) -> None:  # fmt: skip
-    """Write the slices of an image with its mesh over them as PNG, whole or not at all; the same bytes for the same.
+    """Write slices of an image with its mesh as a PNG, whole or not at all; the same inputs give the same bytes.
 
-    Of a volume an axial slice on the left and a sagittal one on the right, 256 x 128 pixels, through the mesh's middle
-    (or, where that is hollow, where most of it is); of a 2-D image one view. Both are in one scale, the same along both
-    sides, and centred on the mesh: x from left to right (left of the patient on the left), y upwards or, in the
-    sagittal view, to the right (back on the left), z upwards. Letters in the lower corners say so: L and R, P and A.
-    What lies beside the image is black.
+    A volume gives an axial slice on the left and a sagittal one on the right, 256 x 128 pixels, through the mesh's
+    middle (or, if that is hollow, where most of it is); a 2-D image gives one view. Both have the same isotropic scale
+    and are centred on the mesh: x from left to right (left of the patient on the left), y upwards or, in the sagittal
+    view, to the right (back on the left), z upwards. Letters in the lower corners mark the sides: L and R, P and A.
+    Pixels outside the image are black.
 
     Parameters
     ----------
@@ -62,20 +62,20 @@ def save_thumbnail(
         Ends in ".png".
     image : Image
     mesh : Mesh
-        Its edges are orange, its boundary more so.
+        Drawn with orange edges and a stronger boundary.
     mask : Image, optional
         From 0 to 1; its outline is blue.
     labels : Image, optional
-        Its colours are those of `tetopt.report.figures.label_figure`.
+        Drawn in the colours of `tetopt.report.figures.label_figure`.
     of_cell : (M,) int64, optional
-        Each cell's label, where there are `labels`: cells of others than 0 have their colours.
+        Label of each cell, with `labels`: cells of labels other than 0 get their colours.
     table : LabelTable
         Colours of labels.
 
     Raises
     ------
     InputError
-        A name that ends otherwise.
+        The name has another suffix.
     """
     save_bytes(check_suffix(path, FIGURE_SUFFIXES), thumbnail_png(image, mesh, mask, labels, of_cell, table))
 
@@ -84,7 +84,7 @@ def thumbnail_png(
     image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
     of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
 ) -> bytes:  # fmt: skip
-    """The bytes of `save_thumbnail`."""
+    """Return the bytes of `save_thumbnail`."""
     views = VIEW_AXES[image.ndim]
     low, high = mesh.points[np.unique(mesh.cells)].min(axis=0), mesh.points[np.unique(mesh.cells)].max(axis=0)
     half = (0.5 + MARGIN_FRACTION) * float((high - low).max())
@@ -126,11 +126,11 @@ def _at(place: NDArray[np.float64], axis: int, value: float) -> NDArray[np.float
 
 
 def _fullest(mesh: Mesh, axis: int) -> float:
-    """Where along a world axis the mesh is cut, mm: its middle, if that is not hollow."""
+    """Return the position of the cut along a world axis, mm: the mesh's middle, if that is not hollow."""
     x, v = mesh.points[mesh.cells][..., axis], volumes(mesh.points, mesh.cells)
     first, last = x.min(axis=1), x.max(axis=1)
     ends = np.linspace(first.min(), last.max(), SLAB_COUNT + 1)
-    # As if each cell's volume were spread evenly between its ends: a few large cells tell as well as many small ones.
+    # Each cell's volume is spread evenly between its ends, so that a few large cells count as well as many small ones.
     filled = np.diff([float((v * np.clip((end - first) / (last - first), 0.0, 1.0)).sum()) for end in ends])
     middle = SLAB_COUNT // 2
     if filled[middle - 1 : middle + 1].mean() >= 0.5 * filled.max():
@@ -140,7 +140,7 @@ def _fullest(mesh: Mesh, axis: int) -> float:
 
 
 def _sampled(image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float) -> NDArray[np.float64]:
-    """The image in a square across the world's axes around a place, pixel by pixel; nan beside it."""
+    """Sample the image in a square around a place, along two world axes; NaN outside the image."""
     n = SIDE_PIXELS * SAMPLES_PER_PIXEL
     steps = (np.arange(n) + 0.5) / n * 2.0 * half - half
     points = np.broadcast_to(place, (n, n, len(place))).copy()
@@ -170,7 +170,7 @@ def _draw_mesh(
         across = ({0, 1, 2} - set(flat)).pop()
         height = mesh.points[:, across] - place[across]
         corners, cells = plane_cut(mesh.points, mesh.cells, height)
-        # A facet that the plane cuts lies only in cells that it cuts: these alone tell which are on the boundary.
+        # The plane cuts all cells of a facet that it cuts, so these cells suffice to find the boundary.
         shared = facets(mesh.cells[cells]) if len(cells) else facets(mesh.cells)
         boundary, _ = triangle_cut(mesh.points, shared.nodes[shared.n_cells == 1], height)
     polygons = corners[..., flat]
@@ -184,7 +184,7 @@ def _draw_mesh(
 
 
 def _png(figure: Figure) -> bytes:
-    """A figure as PNG, in a palette."""
+    """Encode a figure as a PNG with a palette."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     whole = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())

@@ -1,8 +1,8 @@
-// Draws the surfaces in #views-data, one for each canvas in .views, from one common camera.
+// Draws the surfaces in #views-data, one per canvas in .views, from a common camera.
 
 const FRAGMENT = `${SHADING}
   void main() {
-    float grey = float(cell) / 255.0;  // a view's tones stand for its cells
+    float grey = float(cell) / 255.0;  // a view's tones belong to its cells
     colour = vec4(mix(vec3((0.2 + 0.8 * grey) * light(0.5)), vec3(1.0, 0.69, 0.0), 0.75 * edge()), 1.0);
   }`;
 const START = { yaw: Math.atan2(1.25, 0.9), pitch: 0.43, zoom: 1.05, shift: [0, 0] };  // from the right, front and above
@@ -58,13 +58,13 @@ document.querySelectorAll(".views canvas").forEach((canvas, number) => {
   }
   if (draw) {
     drawers.push(draw);
-    // Only a view that was clicked takes the wheel: the others let the page scroll by.
+    // Only a clicked view zooms with the wheel: over the others the page scrolls.
     listen(canvas, { turn, zoom, keys, wheels: () => document.activeElement === canvas });
     new ResizeObserver(redraw).observe(canvas);
   } else {
     const note = document.createElement("p");
     note.className = "failure";
-    note.textContent = "This browser has no WebGL 2, so the 3-D view cannot be shown; see the cutaway picture.";
+    note.textContent = "This browser does not support WebGL 2, so the 3-D view cannot be shown; see the cutaway picture.";
     canvas.replaceWith(note);
   }
 });

@@ -1,4 +1,4 @@
-"""A 3-D view that turns, embedded in a page: the opened meshes as data, drawn by `viewer.js` in the browser's WebGL."""
+"""An interactive 3-D view embedded in a page: opened meshes as data, drawn by `viewer.js` in the browser's WebGL."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tetopt.report.page import data_html, packed, rendered, script_html
 
 
 class View(NamedTuple):
-    """A surface of triangles to look at."""
+    """A triangle surface to view."""
 
     title: str
     points: NDArray[np.float64]  # (N, 3) world mm
@@ -28,26 +28,26 @@ class View(NamedTuple):
 
 
 def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None) -> View:
-    """The surface of a mesh with its right, front, upper octant taken away, so that the inside shows.
+    """Return the surface of a mesh without its right, front, upper octant, which shows the inside.
 
     Parameters
     ----------
     mesh : Mesh
         Tetrahedra.
     means : (M,) float64
-        The value of each cell; a triangle has that of its cell.
+        The value of each cell; a triangle gets that of its cell.
     title : str
     centre : (3,) float64, optional
-        Where the octant's corner is, world mm; the middle of the mesh's box by default. Whole cells are taken away,
-        those whose centroids lie beyond it; if that is all of them, none is.
+        Corner of the octant, world mm; by default the middle of the mesh's box. Cells whose centroids lie beyond it are
+        removed whole; if that would be all cells, none is removed.
 
     Raises
     ------
     InputError
-        A mesh of triangles, or another number of means than of cells.
+        The mesh has triangles, or the number of means is not that of cells.
     """
     if mesh.ndim != 3:
-        raise InputError(f"{title}: expected a mesh of tetrahedra, got one of triangles")
+        raise InputError(f"{title}: expected a tetrahedral mesh, got triangles")
     if len(means) != len(mesh.cells):
         raise InputError(f"{title}: expected one mean for each of {len(mesh.cells)} cells, got {len(means)}")
     if centre is None:
@@ -62,9 +62,9 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
 
 
 def views_html(views: Sequence[View]) -> Markup:
-    """Markup of the views side by side, turned together; with their data and script, without outside references.
+    """Return views side by side that turn together, as markup with data and script, without external references.
 
-    A browser without WebGL 2 or scripts says so in words.
+    A browser without WebGL 2 or scripts shows a message.
     """
     if not views:
         return Markup()
@@ -73,7 +73,7 @@ def views_html(views: Sequence[View]) -> Markup:
 
 
 def _views_data(views: Sequence[View]) -> list[dict[str, Any]]:
-    """Views in one common box: places as 16-bit integers of its half diagonal, values as bytes of a common range."""
+    """Encode views in a common box: positions as 16-bit fractions of its half diagonal, values as bytes of a range."""
     corners = np.concatenate([view.points for view in views])
     low, high = corners.min(axis=0), corners.max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2.0, 1e-300)

@@ -1,5 +1,5 @@
-// What the 3-D views are made of: lists of triangles on the graphics card, a camera that turns about the middle, and what
-// pointers, wheel and keys do with it. A view's own script follows in the same scope.
+// Shared code of the 3-D views: lists of triangles on the graphics card, a camera that turns about the middle, and its
+// control by pointers, wheel and keys. A view's own script follows in the same scope.
 
 const VERTEX = `#version 300 es
   precision highp float; precision highp int;
@@ -17,7 +17,7 @@ const VERTEX = `#version 300 es
     sides = tag & 7u;
     gl_Position = vec4((seen.xy + shift) * scale.xy, -seen.z * scale.z, 1.0);
   }`;
-// What a view's fragment shader begins with: the line along the drawn sides, 0 to 1, and the light on a facet.
+// The beginning of a view's fragment shader: the line along the drawn sides, 0 to 1, and the light on a facet.
 const SHADING = `#version 300 es
   precision highp float; precision highp int; precision highp sampler3D;
   in vec3 world; in vec3 rest; in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
@@ -26,7 +26,7 @@ const SHADING = `#version 300 es
     vec3 step = fwidth(corner);
     vec3 away = smoothstep(vec3(0.0), 1.3 * step, corner);
     for (int k = 0; k < 3; k++) if ((sides & (1u << k)) == 0u) away[k] = 1.0;
-    // Where a triangle is only a few pixels wide, lines would cover it: they fade.
+    // Lines would cover triangles that are only a few pixels wide: they fade there.
     return (1.0 - min(min(away.x, away.y), away.z)) * clamp(0.25 / max(max(step.x, step.y), step.z), 0.0, 1.0);
   }
   float light(float least) {
@@ -41,8 +41,8 @@ function bytes(text) {
   return numbers.buffer;
 }
 
-// Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn, as bits; a
-// value is what a field at the nodes is there, an origin, if the list has them, where the corner is of a mesh at rest.
+// Triangles with three corners of their own; a tag is the cell's number and the drawn sides, as bits; a value is that of
+// a field at the nodes; an origin, if the list has them, is the undeformed position of the corner.
 class Triangles {
   constructor(capacity, hasOrigins = false) {
     this.places = new Float32Array(9 * capacity);
@@ -74,13 +74,13 @@ class Triangles {
   }
 }
 
-// The canvas's WebGL 2, null without; with a kept buffer, so that the view is also there when the page is printed.
+// The canvas's WebGL 2 context, or null; the buffer is preserved, so that the view is visible in print.
 function webgl(canvas) {
   return canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
 }
 
-// A program of the views' vertex shader and a view's fragment shader: where its uniforms are, lists of triangles that
-// it draws, and the camera it draws them from.
+// A program of the shared vertex shader and a view's fragment shader, with its uniforms, its lists of triangles and its
+// camera.
 function painter(gl, fragment) {
   const program = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -118,7 +118,7 @@ function part(gl, program, hasOrigins) {
   gl.bindVertexArray(array);
   for (const [name, numbers] of [["place", 3], ["tag", 1], ["value", 1], ["origin", 3]]) {
     const at = gl.getAttribLocation(program, name);
-    if (at < 0) continue;  // the fragment shader makes nothing of it
+    if (at < 0) continue;  // the fragment shader does not use it
     buffers[name] = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
     if (name !== "origin" || hasOrigins) gl.enableVertexAttribArray(at);
@@ -148,7 +148,7 @@ function part(gl, program, hasOrigins) {
   };
 }
 
-// World axes to the screen's right, up and towards the eye; column by column, as WebGL takes it.
+// Rotation of world axes to the screen's right, up and towards the viewer; by columns, as WebGL expects.
 function turned(camera) {
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const [cp, sp] = [Math.cos(camera.pitch), Math.sin(camera.pitch)];
@@ -161,14 +161,14 @@ function pixels(canvas) {
   return [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * dense)));
 }
 
-// The canvas made as large as it is shown, and that size.
+// Resize the canvas to its displayed size, and return that size.
 function fitted(canvas) {
   const size = pixels(canvas);
   if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   return size;
 }
 
-// What asks for a frame: however often before it, `draw` is called once.
+// Request a frame: `draw` is called once, however many requests come before it.
 function redrawing(draw) {
   let isWaiting = false;
   return () => {
@@ -181,7 +181,7 @@ function redrawing(draw) {
   };
 }
 
-// What turns the camera by angles, and stops when it looks straight down or up.
+// Turn the camera by angles, up to looking straight down or up.
 function turning(camera, redraw) {
   return (right, up) => {
     camera.yaw -= right;
@@ -198,9 +198,9 @@ function cameraKeys(turn, zoom) {
   };
 }
 
-// Pointers, wheel and keys of a canvas. `turn` takes angles, `zoom` a factor and the pixel from the view's middle that is
-// to stay, `move` (where the camera moves) and `pick` (where cells can be clicked on) pixels; `wheels` says whether the
-// wheel is the view's or the page's.
+// Pointers, wheel and keys of a canvas. `turn` takes angles, `zoom` a factor and the pixel, relative to the
+// middle, that stays in place, `move` (if the camera can move) and `pick` (if cells can be clicked) pixels; `wheels` tells
+// whether the wheel belongs to the view or to the page.
 function listen(canvas, { turn, zoom, move, pick, keys, wheels = () => true }) {
   const fingers = new Map();
   const spread = () => {

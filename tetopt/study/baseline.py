@@ -21,7 +21,7 @@ from tetopt.system.files import checked_output, save_json
 
 
 class Baseline(NamedTuple):
-    """What came of it."""
+    """The result of a baseline."""
 
     output: Path
     quality: Quality
@@ -31,12 +31,12 @@ class Baseline(NamedTuple):
 def baseline(
     image_path: Path, output: Path, options: BaselineOptions, json_path: Path | None = None, force: bool = False
 ) -> Baseline:
-    """Segment, extract surfaces, tetrahedralise; write the mesh, and its numbers if they are asked for.
+    """Segment, extract surfaces, tetrahedralise; write the mesh, and its numbers if requested.
 
     Raises
     ------
     InputError
-        Outputs that may not be written, files that cannot be read, or a pipeline that fails or is not installed.
+        An output may not be written, a file cannot be read, or the pipeline fails or is not installed.
     """
     output = checked_output(output, (".vtu",), force)
     json_path = None if json_path is None else checked_output(json_path, (".json",), force)

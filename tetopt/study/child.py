@@ -1,9 +1,8 @@
-"""A pipeline in a process of its own: its memory is its own, and when it crashes or runs wild, only it ends.
+"""A pipeline in a separate process: its memory is separate, and a crash or runaway ends only the process.
 
-The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. Its memory,
-with that of the processes it starts, is watched from the parent as resident pages, not limited by RLIMIT_AS: numba,
-VTK and the allocators reserve far more address space than they ever touch, so a limit on that would end runs that need
-little.
+The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. The
+parent watches the resident memory of the child and its processes instead of setting RLIMIT_AS: numba, VTK and the
+allocators reserve far more address space than they use, so such a limit would end runs that need little memory.
 """
 
 from __future__ import annotations
@@ -30,20 +29,20 @@ from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
 from tetopt.system.interpreter import python_command, python_environment
 
-Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": it is not installed
+Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": not installed
 
 
 class Outcome(NamedTuple):
-    """What became of a run."""
+    """The outcome of a run."""
 
     mesh: Mesh | None  # None after a failure
     seconds: dict[str, float]  # by step, in their order; empty after a failure
     peak_bytes: int  # largest resident memory of the child, interpreter and libraries included
     notes: list[str]
-    failure: str | None  # one line, None if all went well
+    failure: str | None  # one line; None without a failure
     reason: Reason | None = None  # of the failure
-    crashes: tuple[str, ...] = ()  # of this run and of the one that it repeats
-    labels: NDArray[np.int64] | None = None  # of each cell, if the pipeline gives them any
+    crashes: tuple[str, ...] = ()  # of this run and of the one it repeats
+    labels: NDArray[np.int64] | None = None  # of each cell, if the pipeline sets labels
 
 
 def run_in_child(
@@ -56,32 +55,32 @@ def run_in_child(
 ) -> Outcome:
     """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
 
-    A run that is ended by a signal which is not ours (a crash; the system, short of memory) is repeated once: fTetWild
-    crashes at random.
+    A run ended by a foreign signal (a crash, or the system short of memory) is repeated once, as fTetWild crashes at
+    random.
 
     Parameters
     ----------
     pipeline : callable
         The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its temporary files, and
-        those of programs that it runs, lie in a folder that goes away with the child, however it ends.
+        those of the programs it runs, are in a folder that is always removed with the child.
     job : PipelineInput
     title : str
-        What the note that a run is repeated calls it.
+        Name of the pipeline in notes.
     max_seconds : float
-        Wall time of one run, the child's start included, after which it is killed with all that it started.
+        Wall time of one run, including the child's start, after which it is killed with all its processes.
     max_bytes : int, optional
-        Resident memory at which it is killed. It is looked at twenty times a second, so a fast run may pass it by a
-        little.
+        Resident memory at which it is killed. It is checked twenty times a second, so a fast run may exceed it
+        slightly.
 
     Returns
     -------
     Outcome
-        A crash, the time or memory limit, an exception and a missing package are a `failure`, not an exception.
+        Crashes, the time and memory limits, exceptions and missing packages are a `failure`, not an exception.
 
     Raises
     ------
     InputError
-        A limit that is not above 0.
+        A limit is not above 0.
     """
     if not max_seconds > 0.0 or (max_bytes is not None and max_bytes <= 0):
         raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
@@ -89,7 +88,7 @@ def run_in_child(
     if first.reason != "crash":
         return first
     crash = first.failure or ""
-    note(f"{title}: {crash}; once more")
+    note(f"{title}: {crash}; running it again")
     again = _run_once(pipeline, job, max_seconds, max_bytes)
     again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes), crashes=(*first.crashes, *again.crashes))
     if again.failure is None:
@@ -103,7 +102,7 @@ def _run_once(
     deadline = time.monotonic() + max_seconds
 
     def passed(peak: int) -> str | None:
-        """The limit that the run has passed, in words."""
+        """Return the message of a limit that the run exceeds; None without one."""
         if max_bytes is not None and peak > max_bytes:
             return f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
         return f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
@@ -125,7 +124,7 @@ def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
         return Outcome(None, {}, peak, [], limit, "limit")
     if code == 0 and result.is_file():
         (mesh, seconds, notes, labels), own_peak = pickle.loads(result.read_bytes())
-        # Checked, and its arrays locked again: pickle does not keep that.
+        # Checked, with locked arrays again, as pickle keeps neither.
         return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None, labels=labels)
     reason: Reason = "error"
     if (words := signal_words(code)) is not None:
@@ -139,7 +138,7 @@ def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
 
 
 def main(folder: Path) -> None:
-    """Run the job in the folder, and leave its result there, or the reason of its failure."""
+    """Run the job in the folder, and write its result, or the reason of its failure."""
     try:
         pipeline, job = pickle.loads((folder / "job.pickle").read_bytes())
         produced = pipeline(job)

@@ -1,12 +1,11 @@
 """Cleaver's lattice stuffing (Bronson, Levine, Whitaker 2014) through itk-cleaver, on the same labels.
 
-Cleaver meshes a cube of 2^k voxels. The labels are put into the smallest such cube, isotropic, continued by their
+Cleaver meshes a cube of 2^k voxels. The labels are put into the smallest such cube, isotropic, and continued by their
 border values, so that the box's faces are no interfaces and cost no nodes. Cells with their centroid outside the box
-are removed, and the boundary that this leaves is put on the box's faces as fTetWild's is (`tetwild.put_on_box`).
+are removed, and the remaining boundary is moved onto the box's faces as for fTetWild (`tetwild.put_on_box`).
 
-Each run is a process of its own, because Cleaver ends it on inputs it does not like ("Degenerate Tet found"), and
-itk-cleaver 1.3.1 ends it on import with every ITK 5.4 tried (5.4.0, 5.4.2, 5.4.7); with ITK 5.3.0, which needs
-numpy < 2, it works.
+Each run is a separate process, because Cleaver exits on some inputs ("Degenerate Tet found"), and itk-cleaver 1.3.1
+exits on import with every ITK 5.4 tried (5.4.0, 5.4.2, 5.4.7); it works with ITK 5.3.0, which needs numpy < 2.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ from tetopt.system.child import signal_words
 from tetopt.system.extras import pip_install
 from tetopt.system.interpreter import python_command
 
-CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
-FIRST_SCALING = 2.0  # of features, in the first run: on the coarse side, where runs take the least time
-VOXELS_PER_SPACING = 3.0  # of the cube that Cleaver gets, at least, unless the image itself is coarser
+CLEAVER_RUNS = 8  # of one search, at most, including those that crash
+FIRST_SCALING = 2.0  # of features, in the first run: coarse, where runs are fastest
+VOXELS_PER_SPACING = 3.0  # of Cleaver's cube, at least, unless the image itself is coarser
 CUBE_VOXELS = 256  # along an edge of the cube, at most: the next power of two takes eight times the memory
-LIPSCHITZ_BOUND = 0.5  # how fast its cells may grow away from the interfaces
-# With ITK 5.4 its import ends Python.
+LIPSCHITZ_BOUND = 0.5  # growth of cells with the distance from the interfaces
+# With ITK 5.4, importing it ends Python.
 INSTALL_HINT = f"install it with: {pip_install('itk-cleaver', 'itk==5.3.0', 'numpy<2')}"
 
 
@@ -52,37 +51,37 @@ class Cube(NamedTuple):
 
 
 class _RunError(RuntimeError):
-    """Cleaver's process ended without a mesh; the text says how."""
+    """Cleaver's process ended without a mesh; the text is the reason."""
 
 
 def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
     """Cleaver's tetrahedra in the image's box, with about `nodes` nodes.
 
-    Its feature scaling is searched until the number of nodes is within 5 % of the requested one; at most 8 runs, of
-    which the nearest is taken.
+    The feature scaling is searched until the number of nodes is within 5 % of the requested one, in at most 8 runs;
+    the closest is used.
 
     Parameters
     ----------
     image : Image
-        3-D; its box is to be filled.
+        3-D image; its box is filled.
     labels : Image
         Whole numbers, on the image's voxels.
     nodes : int
         Requested number of nodes, 8 or more.
     order : {1, 2}
-        Of the cells whose nodes are counted.
+        Order of the cells whose nodes are counted.
 
     Returns
     -------
     Filled
-        Mesh in the world, positively oriented. Notes tell of cells removed outside the box, of runs that crashed, of
-        a number of nodes that could not be met, and of a box that could not be filled exactly.
+        Mesh in the world, positively oriented. Notes report cells removed outside the box, crashed runs, a missed
+        number of nodes, and a box that is not filled exactly.
 
     Raises
     ------
     InputError
-        itk-cleaver is missing or cannot be loaded, labels that do not fit the image or hold one value only, fewer
-        than 8 nodes, or no run that gave a mesh.
+        itk-cleaver is missing or cannot be loaded; the labels do not fit the image or have only one value; fewer
+        than 8 nodes are requested; no run gave a mesh.
     """
     _check(image, labels, nodes)
     cube = labels_in_cube(image, labels, node_spacing(image, corners_for(nodes, order)) / VOXELS_PER_SPACING)
@@ -90,7 +89,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
     notes: list[str] = []
 
     def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64], int] | None:
-        """Nodes and cells in the box, and the number of cells outside."""
+        """Return nodes and cells in the box, and the number of cells outside."""
         try:
             points, cells = _run(cube, factor)
         except _RunError as error:
@@ -105,7 +104,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
         first=FIRST_SCALING, most=CLEAVER_RUNS,
     )  # fmt: skip
     if not runs:
-        raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {INSTALL_HINT}")
+        raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); request more nodes, or {INSTALL_HINT}")
     points, cells, n_removed = runs[0].result
     search = time.perf_counter() - begin - runs[0].seconds
     try:
@@ -116,7 +115,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
         notes.append(f"{n_removed} cells outside the box removed")
     n_nodes = node_count(points, cells, order)
     if not is_near(n_nodes, nodes):
-        notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
+        notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver, {nodes} were requested")
     world = image.to_world(points / image.spacing)
     return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
 
@@ -129,7 +128,7 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
     if not labels.is_whole:
         raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
     if labels.range[0] == labels.range[1]:
-        raise InputError("labels: expected two or more, got one; there is no interface to mesh")
+        raise InputError("labels: expected two or more, got one, which has no interface to mesh")
     if nodes < 8:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     probe = _python("from itk import CleaverImageToMeshFilter")
@@ -138,7 +137,7 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
 
 
 def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
-    """Labels sampled (nearest voxel) on a cube of 2^k isotropic voxels around the box, of about `voxel` mm or less."""
+    """Sample labels (nearest voxel) on a cube of 2^k isotropic voxels around the box, of about `voxel` mm or less."""
     lengths = image.spacing * image.shape
     n_across = lengths.max() / max(voxel, image.spacing.min())
     n = int(min(2 ** np.ceil(np.log2(max(n_across, 16.0))), CUBE_VOXELS))
@@ -153,11 +152,11 @@ def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
 
 
 def _run(cube: Cube, feature_scaling: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """One run of Cleaver in a process of its own; points in the box frame, and cells."""
+    """Run Cleaver in a separate process; return points in the box frame, and cells."""
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
         np.savez(folder / "job.npz", labels=cube.labels, feature_scaling=feature_scaling, lipschitz=LIPSCHITZ_BOUND)
-        # The script itself, not the package: ITK 5.3 and tetopt need not share their numpy's habits.
+        # The script itself, not the package: ITK 5.3 and tetopt may need different versions of numpy.
         done = _python(Path(__file__).with_name("cleaver_run.py").read_text(encoding="utf-8"), str(folder))
         if not (folder / "mesh.npz").is_file():
             raise _RunError(_ending(done))
@@ -173,5 +172,5 @@ def _python(program: str, *arguments: str) -> subprocess.CompletedProcess[Any]:
 
 
 def _ending(done: subprocess.CompletedProcess[Any]) -> str:
-    """How a process ended, in a few words: its signal, or its last line."""
+    """Describe the end of a process: its signal, or its last line."""
     return signal_words(done.returncode) or last_line(done.stderr) or last_line(done.stdout) or "no message"

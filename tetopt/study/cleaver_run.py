@@ -8,7 +8,7 @@ import numpy as np
 
 
 def main(folder: Path) -> None:
-    """Mesh the labels; points go out in voxels of the cube, 0 to n."""
+    """Mesh the labels; points are in voxels of the cube, 0 to n."""
     itk = importlib.import_module("itk")
     with np.load(folder / "job.npz") as job:
         # ITK's arrays run z, y, x.

@@ -1,7 +1,7 @@
-"""tetopt against the conventional pipelines: run, measured alike, and set side by side.
+"""Comparison of tetopt with the conventional pipelines, with the same measures for all.
 
-Every pipeline runs in a process of its own on the same image for the same number of nodes, and every mesh is measured
-by the same functions: the sampler, the shape measures, and the compression test against a voxel grid's solution.
+Every pipeline runs in a separate process on the same image for the same number of nodes, and the same functions
+measure every mesh: the sampler, the shape measures, and the compression test against a voxel grid's solution.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ from tetopt.system.files import save_json
 from tetopt.system.incoming import own_bytes, text_of
 from tetopt.system.work_directory import LOCK_NAME, Layout, locked
 
-Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its settings, as JSON has it
-# Settings that no finished run's numbers depend on: what else is compared, and limits that a finished run kept to. Its
-# own number of nodes and its program are told besides; the reference's size is, once it is decided.
+Facts = dict[str, Any]  # inputs of a comparison besides its settings, as JSON values
+# Settings that do not affect a finished run's numbers: the other pipelines, and limits that it has met. Its own number
+# of nodes and its program are part of its key, and so is the reference's size, once decided.
 FREE_SETTINGS = {
     "nodes", "pipelines", "programs", "repeats", "curve", "tradeoff", "max_seconds", "max_bytes", "reference_seconds"
 }  # fmt: skip
@@ -65,10 +65,10 @@ RUNS = Layout("a comparison", rf"{LOCK_NAME}|reference\.json|[\w-]+-\d+(-quadrat
 
 
 class Comparison(NamedTuple):
-    """What is compared on what, and the words for it in the report."""
+    """Inputs of a comparison, with their descriptions for the report."""
 
     image: Image
-    labels: Image | None  # for tetopt's own pipelines besides the image, and for those that segment
+    labels: Image | None  # for tetopt's own pipelines, with the image, and for those that segment
     mapping: ModulusMapping  # from intensity to kPa
     settings: Settings
     image_source: records.ImageSource
@@ -78,7 +78,7 @@ class Comparison(NamedTuple):
 
 
 class Standard(NamedTuple):
-    """What all meshes are measured against."""
+    """The reference that all meshes are measured against."""
 
     image: Image
     labels: Image  # materials, on the image's voxels
@@ -90,7 +90,7 @@ class Standard(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """What all runs of a comparison share."""
+    """Data that all runs of a comparison share."""
 
     comparison: Comparison
     standard: Standard
@@ -101,16 +101,16 @@ class Bench(NamedTuple):
 
 
 def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
-    """A modulus from any image: 1 to 10 kPa between its 0.5th and 99.5th percentile, and the words for it."""
+    """Return a modulus mapping for any image, 1 to 10 kPa from its 0.5th to 99.5th percentile, and its description."""
     low, high = (float(p) for p in np.percentile(image.data, [0.5, 99.5]))
     if high <= low:
-        raise InputError("image: hardly any contrast between its percentiles; give `young`")
+        raise InputError("image: too little contrast between its percentiles; pass `young`")
     words = f"1 kPa at intensity {low:g} and below, 10 kPa at {high:g} and above, linear between"
     return [(low, 1.0), (high, 10.0)], words
 
 
 def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Settings) -> Standard:
-    """The reference solutions, which take a while.
+    """Compute the reference solutions, which may take minutes.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
 
 
 def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings) -> int:
-    """Size of the reference that `reference_seconds` and the memory allow; another one in every run, by a little."""
+    """Return the reference size that `reference_seconds` and the memory allow, which differs slightly between runs."""
     budget = affordable_dofs(young_image(image, mapping), settings.nus, settings.reference_seconds, settings.percent)
     limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
     note(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
@@ -146,7 +146,7 @@ def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings) ->
 
 
 def _settled(comparison: Comparison, facts: Facts, runs: Path, *, resume: bool) -> Comparison:
-    """The size of the reference decided, and kept in the runs' folder for `resume`."""
+    """Decide the size of the reference, and store it in the runs' folder for `resume`."""
     settings, path = comparison.settings, runs / "reference.json"
     if settings.reference_dofs is None:
         choice = facts | as_json({key: getattr(settings, key) for key in ("nus", "percent", "reference_seconds")})
@@ -160,14 +160,14 @@ def _settled(comparison: Comparison, facts: Facts, runs: Path, *, resume: bool) 
 
 
 def _write_down(path: Path, content: Any) -> None:
-    """A file for `_read_back`: with a checksum, since what is resumed may have been cut off, or edited."""
+    """Write a file for `_read_back`, with a checksum, as files may be cut off or edited before they are resumed."""
     save_json(path, {"content": content})
-    content = json.loads(path.read_text(encoding="utf-8"))["content"]  # as it will be read: what is not finite is null
+    content = json.loads(path.read_text(encoding="utf-8"))["content"]  # as it will be read: non-finite numbers are null
     save_json(path, {"content": content, "sha256": _checksum(content)})
 
 
 def _read_back(path: Path) -> Any:
-    """What was written down; None if there is no such file, or it is not as it was written."""
+    """Read a file of `_write_down`; return None if it is missing or has changed."""
     try:
         row = json.loads(own_bytes(path))
         return row["content"] if row["sha256"] == _checksum(row["content"]) else None
@@ -176,19 +176,19 @@ def _read_back(path: Path) -> Any:
 
 
 def _checksum(content: Any) -> str:
-    """Of what is read from a JSON file."""
+    """Return the checksum of a JSON file's content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-# One mesh, measured.
+# Measures of one mesh.
 
 
 def measured(
     standard: Standard, mesh: Mesh, percent: float, order: int = 1, of_cell: NDArray[np.int64] | None = None
 ) -> Measurement:
-    """Everything that is compared of a mesh with cells of this order, compressed by `percent` of its height.
+    """Measure everything that is compared of a mesh with cells of this order, compressed by `percent` of its height.
 
-    `of_cell` (M,) are the labels that its pipeline gives the cells; of most of its voxels a cell's where -1, or None.
+    `of_cell` (M,) are the labels that its pipeline gives the cells; where -1, or if None, those of most voxels.
     """
     image = standard.image
     moments = cell_moments(image, mesh)
@@ -228,11 +228,11 @@ def _label_rows(
     means: NDArray[np.float64],
     owner: NDArray[np.int64],
 ) -> list[records.LabelRow]:
-    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, contact, voxels of its cells, E_D in it."""
+    """Return a row for each label: `LabelFidelity`, `LabelInterface`, contact, voxels of its cells, E_D in it."""
     of_voxels = cell_labels(standard.labels, mesh)
     of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
     label = standard.labels.data.ravel().astype(np.int64)
-    # Outside of the mesh there is label 0, as `label_fidelity` has it.
+    # Outside the mesh the label is 0, as in `label_fidelity`.
     painted = np.bincount(np.where(owner >= 0, of_cell[owner], 0).ravel(), minlength=int(label.max()) + 1)
     h = standard.image.data.ravel().astype(np.float64)
     squares = np.bincount(label, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
@@ -258,21 +258,21 @@ def _label_rows(
 
 
 def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> records.Simulation:
-    """The compression test on a mesh, and how far it is from the reference, with each average of the moduli."""
+    """Run the compression test on a mesh, and measure its errors against the reference, for each average of moduli."""
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
     averages: dict[str, records.Solved] = {}
     for average in standard.averages:
         young = element_young(standard.modulus_fine, mesh, None, average, order)
         begin = time.thread_time()
-        # By multigrid, whatever the size, so that the times of all meshes are of one solver.
+        # By multigrid for any size, so that all times are of one solver.
         pressed = compression(
             mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order, method="amg"
         )
         seconds = time.thread_time() - begin
         errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
         averages[average] = records.Solved(pressed.strain_energy, errors, seconds)
-    system = conditioning(pressed.system)  # of the last, the average that is set
+    system = conditioning(pressed.system)  # for the last, the average that is set
     return records.Simulation(system.lambda_max, system.cond, system.cg_iterations, averages)
 
 
@@ -284,24 +284,24 @@ def run(
 ) -> tuple[Report, dict[int, dict[str, Mesh]]]:
     """Run and measure every pipeline, for linear and for quadratic cells.
 
-    Returns what `report.json` holds, and the mesh of each pipeline's first run by the order of the cells and by name.
+    Return the content of `report.json`, and the mesh of each pipeline's first run by order of the cells and by name.
 
     Parameters
     ----------
     folder : Path
-        Each run leaves its numbers and its mesh in `folder/runs`.
+        Each run writes its numbers and its mesh to `folder/runs`.
     comparison : Comparison
-        Without labels the pipelines that segment find `settings.classes` classes.
+        Without labels, the pipelines that segment use `settings.classes` classes.
     classes : Image
-        Materials for the rows by label and the interfaces: the labels given, or classes of the voxels.
+        Materials for the rows by label and the interfaces: given labels, or classes of the voxels.
     resume : bool
         Keep finished runs of the same image, settings and versions.
 
     Raises
     ------
     InputError
-        As `prepared`; `folder` holds the report of another comparison that `resume` would replace; another run has
-        `folder/runs`, or it holds what is not tetopt's.
+        As `prepared`; `folder` has the report of another comparison, which `resume` would replace; another run uses
+        `folder/runs`, or it contains foreign files.
     """
     if resume:
         _check_resumable(folder, comparison)
@@ -313,7 +313,7 @@ def run(
 def _run(
     runs: Path, comparison: Comparison, classes: Image, *, resume: bool
 ) -> tuple[Report, dict[int, dict[str, Mesh]]]:
-    """The comparison, with the work directory of its runs."""
+    """Run the comparison, with the work directory of its runs."""
     begin = time.perf_counter()
     facts = _facts(comparison)
     comparison = _settled(comparison, facts, runs, resume=resume)
@@ -355,7 +355,7 @@ def _run(
 
 
 def _machine() -> dict[str, int | str | None]:
-    """Where it ran, and how busy that was: times of a machine whose load is above its cores are not to be cited."""
+    """Describe the machine and its load: times are unreliable if the load exceeds the number of cores."""
     load = f"{os.getloadavg()[2]:.1f}" if hasattr(os, "getloadavg") else None
     return {
         "cores": os.cpu_count(), "load, mean of 15 minutes": load, "processor": _processor(),
@@ -364,7 +364,7 @@ def _machine() -> dict[str, int | str | None]:
 
 
 def _processor() -> str:
-    """What the processor is called: /proc knows on Linux, where `platform` often does not."""
+    """Return the processor's name, on Linux from /proc, as `platform` often lacks it."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         for line in lines:
@@ -374,7 +374,7 @@ def _processor() -> str:
 
 
 def _check_resumable(folder: Path, comparison: Comparison) -> None:
-    """InputError if the folder holds the report of another comparison, which resuming would replace."""
+    """Raise InputError if the folder has the report of another comparison, which resuming would replace."""
     path = folder / "report.json"
     if not path.is_file():
         return
@@ -384,11 +384,11 @@ def _check_resumable(folder: Path, comparison: Comparison) -> None:
     except (ValueError, KeyError, TypeError, RecursionError):
         earlier = None
     if earlier != (comparison.settings.nodes, comparison.image_source.sha256):
-        raise InputError(f"{path}: is of another comparison (image or `nodes`); take another folder, or `force`")
+        raise InputError(f"{path}: belongs to another comparison (image or `nodes`); use another folder, or `force`")
 
 
 def _peers() -> dict[str, str]:
-    """Versions of the peers that are installed."""
+    """Return the versions of the installed peers."""
     installed = {}
     for name in ("pytetwild", "itk-cleaver"):
         with contextlib.suppress(PackageNotFoundError):
@@ -397,12 +397,12 @@ def _peers() -> dict[str, str]:
 
 
 def _programs(settings: Settings) -> dict[str, str]:
-    """What stands for a version of the user's own programs: checksums of the files that their command lines name."""
+    """Return checksums of the files in the command lines of the user's programs, in place of versions."""
     return {f"{each.name}, SHA-256 of its files": ", ".join(file_checksums(each)) for each in settings.programs}
 
 
 def _facts(comparison: Comparison) -> Facts:
-    """Image, labels, moduli and versions: not the mapping's words, which may be the name of a file that has changed."""
+    """Return image, labels, moduli and versions, without the mapping's text, which may name a file that has changed."""
     source = comparison.label_source
     modulus = young_image(comparison.image, comparison.mapping).data
     facts = {
@@ -415,7 +415,7 @@ def _facts(comparison: Comparison) -> Facts:
 
 
 def _key(bench: Bench, name: str) -> str:
-    """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
+    """Return a checksum of everything that a finished run's numbers depend on, without the other pipelines."""
     settings = bench.comparison.settings
     same = {key: value for key, value in as_json(settings._asdict()).items() if key not in FREE_SETTINGS}
     program = [[each.command, file_checksums(each)] for each in settings.programs if each.name == name]
@@ -423,12 +423,12 @@ def _key(bench: Bench, name: str) -> str:
 
 
 def _run_path(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Path:
-    """Of the numbers of a run; its mesh lies beside."""
+    """Return the path of a run's numbers; its mesh is beside it."""
     return bench.folder / f"{name}-{nodes}{'-quadratic' if order == 2 else ''}-{repeat}.json"
 
 
 def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
-    """A pipeline as often as its result varies; the first failure is the last attempt."""
+    """Run a pipeline, several times if its result varies, until the first failure."""
     settings = bench.comparison.settings
     attempts: list[Attempt] = []
     while len(attempts) < (settings.repeats if bench.pipelines[name].is_random else 1):
@@ -439,7 +439,7 @@ def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
 
 
 def _kept(path: Path, key: str) -> Attempt | None:
-    """A finished run's numbers, if they are whole, of the same key and of the mesh that lies beside them."""
+    """Return a finished run's numbers if they are complete and belong to the same key and to the mesh beside them."""
     content = _read_back(path)
     if not isinstance(content, dict) or content.get("key") != key:
         return None
@@ -451,13 +451,13 @@ def _kept(path: Path, key: str) -> Attempt | None:
 
 
 def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Attempt:
-    """One pipeline once, from its file if that is finished and of the same key."""
+    """Run a pipeline once, or read its file if that is finished and has the same key."""
     path = _run_path(bench, name, order, nodes, repeat)
     title = bench.pipelines[name].title + (", quadratic" if order == 2 else "")
     key = _key(bench, name)
     kept = _kept(path, key) if bench.resume else None
     if kept is not None:
-        note(f"{title}, {nodes} nodes: kept from before")
+        note(f"{title}, {nodes} nodes: finished before")
         return kept
     note(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings
@@ -486,12 +486,12 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     fraction = "none" if measurement.E_D_fraction is None else f"{measurement.E_D_fraction:.4f}"
     note(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
-    # Read back, so that a kept run and a new one are the same: what is not finite is None in both.
+    # Read back, so that a kept run and a new one are equal: non-finite numbers are None in both.
     return from_json(Attempt, _read_back(path))
 
 
 def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> records.PipelineResult:
-    """A pipeline's entry in the report."""
+    """Return a pipeline's entry in the report."""
     runs = [attempt.run for attempt in attempts if attempt.run is not None]
     failures = [attempt.failure for attempt in attempts if attempt.failure is not None]
     notes = list(dict.fromkeys(note for attempt in attempts for note in attempt.notes))
@@ -506,7 +506,7 @@ def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> records.P
 
 
 def elementwise(rows: list[Any], of: Callable[[Any], Any]) -> Any:
-    """Nested numbers of several runs made one by `of`; what is no number, or missing in one, is the first's."""
+    """Combine nested numbers of several runs by `of`; anything else, or missing in one run, comes from the first."""
     first = rows[0]
     if hasattr(first, "_fields"):
         return type(first)(*(elementwise(list(parts), of) for parts in zip(*rows, strict=True)))
@@ -522,7 +522,7 @@ def elementwise(rows: list[Any], of: Callable[[Any], Any]) -> Any:
 
 
 def _curve(bench: Bench, result: records.PipelineResult, order: int) -> records.Curve:
-    """Errors against the number of nodes; one run a count besides the main one. Failures are noted in `result`."""
+    """Return errors by number of nodes, with one run per further number; failures are noted in `result`."""
     runs = [] if result.median is None else [result.median]
     settings = bench.comparison.settings
     counts = sorted({max(round(factor * settings.nodes), 20) for factor in settings.curve} - {settings.nodes})
@@ -542,7 +542,7 @@ def _curve(bench: Bench, result: records.PipelineResult, order: int) -> records.
 def _reference_grid(standard: Standard) -> records.ReferenceGrid:
     first = next(iter(standard.references.values()))
     is_same = standard.modulus.shape == standard.image.shape
-    note = "a hexahedron to every voxel" if is_same else "the modulus averaged over a coarser grid, for meshes too"
+    note = "one hexahedron per voxel" if is_same else "the modulus averaged over a coarser grid, also for meshes"
     by_nu = {
         nu: records.ReferenceEnergy(each.strain_energy, each.own_error, each.work.iterations)
         for nu, each in standard.references.items()

@@ -1,4 +1,4 @@
-"""What a comparison's meshes are judged by: measures in four groups, who is best, and what each does not see."""
+"""Criteria of a comparison: measures in four groups, their best values, and what each does not capture."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ import numpy as np
 from tetopt.study.compare_report import ORDER_WORDS, LabelRow, PipelineResult, PipelineRun, Report, averages_of
 
 GROUPS = ("Image", "Shape", "Simulation", "Cost")
-JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+JUDGED_VOXELS = 500  # labels with more are judged; a mesh of few nodes keeps only some smaller ones
 COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.reference.Errors`
     ("strain-energy", "strain_energy"),
     ("displacement", "displacement"),
     ("interface-strain", "interface_strain"),
 )
 MEBI_BYTES = 1e-6  # megabytes in a byte
-FULL_DIGITS = (1e4, 1e9)  # from which a number is printed without a fraction, and below which in full
-EQUAL_FRACTION = 0.005  # of a value: one that differs by less is no different, and three digits do not show it
+FULL_DIGITS = (1e4, 1e9)  # numbers from the first are printed without a fraction, below the second in full
+EQUAL_FRACTION = 0.005  # of a value: smaller differences do not count, and three digits do not show them
 
 
 class Criterion(NamedTuple):
-    """What a row of a table compares."""
+    """A row of a table."""
 
     group: str  # of `GROUPS`
-    part: str  # the heading that it stands under
+    part: str  # its heading
     title: str
     value: Callable[[PipelineRun], float | None]
     better: int  # -1 if smaller is better, +1 if larger, 0 if neither
     order: int = 1  # of the cells whose meshes are compared
-    is_detail: bool = False  # in the table that is folded away
+    is_detail: bool = False  # in the folded table
     is_headline: bool = False
-    blind: str = ""  # what it does not see, in a line
-    is_timed: bool = False  # of the machine as it was then: without repeats there is no verdict on it
+    blind: str = ""  # what it does not capture, in a line
+    is_timed: bool = False  # depends on the machine's load: no verdict without repeats
     is_error: bool = False  # against the reference
-    own_change: float | None = None  # of the reference, from its half resolution; None where that is not known
+    own_change: float | None = None  # of the reference, from its half resolution; None if unknown
 
 
 class CriterionEntry(NamedTuple):
-    """What a pipeline has for a criterion."""
+    """A pipeline's value for a criterion."""
 
     value: float | None  # median
     low: float | None
@@ -48,33 +48,33 @@ class CriterionEntry(NamedTuple):
 
     @property
     def known(self) -> tuple[float, float, float] | None:
-        """Median, lowest and highest, where there are any."""
+        """Median, lowest and highest value, if any."""
         return (
             None if self.value is None or self.low is None or self.high is None else (self.value, self.low, self.high)
         )
 
 
 def criteria(report: Report) -> list[Criterion]:
-    """The rows of all tables, in order."""
+    """Return the rows of all tables, in order."""
     ratios = fem_ratios(report)
     return [
         Criterion("Image", "Image", "E_D, fraction of the image's variance", _at("E_D_fraction"), -1, is_headline=True,
-            blind="where the error lies, and whether it matters there: noise within a cell counts like an edge"),
+            blind="where the error is, and whether it matters there: noise within a cell counts like an edge"),
         Criterion("Image", "Image", "voxels outside the mesh", _at("n_missed_voxels"), -1, is_detail=True),
         *_label_criteria(report),
         *_shape_criteria(),
         *(row for nu in ratios for order in ORDER_WORDS for row in _fem_criteria(report, nu, order, nu == ratios[0])),
         Criterion("Cost", "Cost", "wall time, s", lambda run: run.seconds_total, -1, is_headline=True, is_timed=True,
-            blind="the runs that only met the number of nodes, and the loading of compiled code (both below)"),
+            blind="the search for the number of nodes, and the loading of compiled code (both below)"),
         Criterion("Cost", "Cost", "peak memory, MB", lambda run: run.peak_bytes * MEBI_BYTES, -1, is_timed=True,
-            blind="what the interpreter and its libraries take, which is in it, from what the mesh takes"),
+            blind="the fraction that the interpreter and its libraries take"),
         Criterion("Cost", "Cost", "nodes", _at("n_nodes"), 0),
         Criterion("Cost", "Cost", "tetrahedra", _at("n_cells"), 0),
     ]  # fmt: skip
 
 
 def _at(*keys: str) -> Callable[[PipelineRun], float | None]:
-    """What stands at this place of a run's measurement; None where a table on the way has no such row."""
+    """Return a function for the value at this place of a run's measurement; None if a table lacks the row."""
 
     def value(run: PipelineRun) -> Any:
         item: Any = run.measurement
@@ -97,11 +97,11 @@ def _shape_criteria() -> list[Criterion]:
     errors = {"mean": "(i) mean", "harmonic_mean": "(ii) harmonic mean", "l2": "(iii) L2", "worst": "(iv) worst"}
     kinds = ("sliver", "cap", "needle", "wedge", "spade")
     return [
-        row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail; 1/3 is a regular tetrahedron"),
-        row("p1 rho", ("p1_rho",), 1, "the hundredth of the cells that is worse"),
-        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells are near it: it is that of one cell"),
+        row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail (1/3: regular tetrahedron)"),
+        row("p1 rho", ("p1_rho",), 1, "the worst 1 % of the cells"),
+        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells are near it: it is one cell's angle"),
         Criterion("Shape", "Shape", "bad cells (3 rho < 0.3), %", bad_percent, -1, is_headline=True,
-            blind="how bad they are, and of which kind: slivers hurt a stiffness matrix more than needles (below)"),
+            blind="how bad they are, and their kind: slivers harm a stiffness matrix more than needles (below)"),
         row("min rho", ("min_rho",), 1),
         *(row(f"error {title}", ("errors", name), -1) for name, title in errors.items()),
         row("dihedral angle p1, °", ("p1_dihedral",), 1),
@@ -119,7 +119,7 @@ def _label_criteria(report: Report) -> list[Criterion]:
     ) -> Callable[[PipelineRun], float | None]:
         def of_run(run: PipelineRun) -> float | None:
             values = [value(row) for row in run.measurement.labels if row.label in judged]
-            # Without a lost label, which has no surface, the mean over the others would flatter.
+            # A lost label has no surface; the mean over the others alone would be too good.
             return of(values) if values and None not in values else None
 
         return of_run
@@ -136,13 +136,13 @@ def _label_criteria(report: Report) -> list[Criterion]:
         return max(map(abs, values))
 
     rows: list[tuple[str, Callable[[PipelineRun], float | None], int, str]] = [
-        ("mean label Dice", over(mean, attrgetter("dice")), 1, "thin parts, which weigh by their volume alone"),
+        ("mean label Dice", over(mean, attrgetter("dice")), 1, "thin parts, which count only by volume"),
         ("smallest label Dice", over(min, attrgetter("dice")), 1, "all labels but one"),
         ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1, "single spikes and holes"),
-        ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1, "the twentieth beyond it"),
+        ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1, "the 5 % beyond it"),
         ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is: lost and gained "
-            "parts make up for each other"),
-        ("labels lost (of any size)", _n_lost, -1, "labels of which a single cell is left"),
+            "parts cancel each other"),
+        ("labels lost (of any size)", _n_lost, -1, "labels that keep a single cell"),
         ("label area over smoothed voxels', mean by voxels", by_voxels(attrgetter("area_ratio")), 0, ""),
         ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1, ""),
         ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1, ""),
@@ -160,7 +160,7 @@ def _label_criteria(report: Report) -> list[Criterion]:
 
 
 def judged_labels(report: Report) -> dict[int, int]:
-    """Voxels of the labels that are judged: the large ones if there are any, and no given segmentation's background."""
+    """Return the voxels of the judged labels: the large ones if any, without a given segmentation's background."""
     voxels = voxels_by_label(report)
     if _has_background(report):
         del voxels[0]
@@ -172,19 +172,19 @@ def _has_background(report: Report) -> bool:
 
 
 def which_labels(report: Report) -> str:
-    """Which labels are judged, in words."""
+    """Describe the judged labels."""
     is_large = any(n > JUDGED_VOXELS for n in judged_labels(report).values())
     size = f"above {JUDGED_VOXELS} voxels" if is_large else "of any size"
-    return f"{size}, background 0 not counted" if _has_background(report) else size
+    return f"{size}, without background 0" if _has_background(report) else size
 
 
 def voxels_by_label(report: Report) -> dict[int, int]:
-    """Voxels of each label in the image."""
+    """Return the number of voxels of each label in the image."""
     return {row.label: row.voxels for each in report.pipelines for run in each.runs for row in run.measurement.labels}
 
 
 def volume_error(row: LabelRow) -> float | None:
-    """Of a label in the mesh, as a fraction of its volume in the image."""
+    """Return the volume error of a label in the mesh, as a fraction of its volume in the image."""
     return row.mesh_volume_mm3 / row.volume_mm3 - 1.0 if row.volume_mm3 else None
 
 
@@ -194,16 +194,16 @@ def _n_lost(run: PipelineRun) -> int | None:
 
 
 def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[Criterion]:
-    """Of one Poisson's ratio and one order of the cells; the first ratio's displacement is in the headline."""
+    """Return criteria for one Poisson's ratio and order of cells; the headline has the first ratio's displacement."""
     word, average = ORDER_WORDS[order], report.options.average
     part = f"Compression, ν = {nu}, {word} cells"
     blind = {
-        "strain_energy": "errors that make up for each other: it is one number of the whole body",
-        "displacement": "strains, which may be wrong where displacements are right",
+        "strain_energy": "errors that cancel each other: it is one number for the whole body",
+        "displacement": "strains, which may be wrong even if displacements are right",
         "interface_strain": "anything but the voxels beside interfaces of the labels or classes",
     }
     known = report.reference.by_nu.get(nu)
-    own = {} if known is None else known.own_error._asdict()  # which has no strain
+    own = {} if known is None else known.own_error._asdict()  # the reference's, without strain
     rows = [
         Criterion("Simulation", part, f"{title} error", fem_error(nu, average, name), -1, order,
             is_headline=is_first and name == "displacement", blind=blind[name],
@@ -226,27 +226,27 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
 
 
 def fem_error(nu: str, average: str, name: str) -> Callable[[PipelineRun], float | None]:
-    """An error of the compression, by its field's name."""
+    """Return a function for an error of the compression, by its field's name."""
     return _at("fem", nu, "averages", average, "errors", name)
 
 
 def fem_ratios(report: Report) -> list[str]:
-    """Poisson's ratios of which any pipeline has a result."""
+    """Return the Poisson's ratios for which any pipeline has a result."""
     return sorted({nu for each in report.pipelines for run in each.runs for nu in run.measurement.fem}, key=float)
 
 
 def of_order(report: Report, order: int) -> list[PipelineResult]:
-    """The pipelines with their meshes for cells of this order."""
+    """Return the pipelines with their meshes for cells of this order."""
     return report.pipelines if order == 1 else report.quadratic
 
 
 def entries_of(criterion: Criterion, report: Report) -> list[CriterionEntry]:
-    """What each pipeline has for a criterion."""
+    """Return each pipeline's value for a criterion."""
     return [entry(criterion.value, pipeline) for pipeline in of_order(report, criterion.order)]
 
 
 def entry(value_of: Callable[[PipelineRun], float | None], pipeline: PipelineResult) -> CriterionEntry:
-    """Median and range over a pipeline's runs; all None if no run has a value."""
+    """Return median and range over a pipeline's runs; all None if no run has a value."""
     values = [value for run in pipeline.runs if (value := value_of(run)) is not None]
     return (
         CriterionEntry(float(np.median(values)), min(values), max(values))
@@ -256,7 +256,7 @@ def entry(value_of: Callable[[PipelineRun], float | None], pipeline: PipelineRes
 
 
 def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str:
-    """Why a difference between the pipelines at two places says nothing of their meshes; "" where it does."""
+    """Return why a difference between two pipelines is not due to their meshes; "" if it is."""
     a, b = (of_order(report, criterion.order)[place] for place in (one, other))
     if criterion.is_timed and len(a.runs) == len(b.runs) == 1:
         return "one run each"
@@ -268,7 +268,7 @@ def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str
 
 
 def winners(better: int, values: Sequence[float | None]) -> list[int]:
-    """Places of the best values, equal ones as printed included; none if fewer than two differ."""
+    """Return the places of the best values, including ties as printed; none if fewer than two differ."""
     known = [(number, value) for number, value in enumerate(values) if value is not None]
     if better == 0 or len({number_text(value) for _, value in known}) < 2:
         return []
@@ -277,7 +277,7 @@ def winners(better: int, values: Sequence[float | None]) -> list[int]:
 
 
 def number_text(value: float | None) -> str:
-    """A number as the page prints it: whole ones in full, others to four digits; "–" for none."""
+    """Format a number for the page: whole numbers in full, others to four digits; "–" for None."""
     if value is None:
         return "–"
     rounded, full = FULL_DIGITS
@@ -287,17 +287,17 @@ def number_text(value: float | None) -> str:
 
 
 def short_text(value: float | None) -> str:
-    """Three digits: as many as repeats of a run leave standing."""
+    """Format a number to three digits, which repeated runs reproduce."""
     return "–" if value is None else number_text(float(f"{value:.3g}"))
 
 
 def ratio_text(ratio: float) -> str:
-    """A ratio to three digits, as "0.8×"."""
+    """Format a ratio to three digits, as "0.8×"."""
     return f"{short_text(ratio)}×"
 
 
 def loss_text(value: float | None, best: float) -> str:
-    """How far a value is from the best, in words."""
+    """Describe the distance of a value from the best."""
     if value is None:
         return "no value"
     if best > 0.0 and value > 0.0:

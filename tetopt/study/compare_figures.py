@@ -24,7 +24,7 @@ from tetopt.report.viewer import view_of
 from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
 
-# Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
+# Okabe and Ito's palette, safe for colour blindness, without its yellow, which is invisible on white.
 LINE_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LINE_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
@@ -36,7 +36,7 @@ ERROR_TITLES = (
 )
 Value = Callable[[Measurement], Any]
 Place = tuple[float | None, float | None]  # of a point, across and up
-SHORT_RANGE = 12.0  # a logarithmic axis to less than this many times its start: powers of ten alone say too little
+SHORT_RANGE = 12.0  # ratio of the ends of a logarithmic axis: below it, powers of ten are too few ticks
 
 
 def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
@@ -48,19 +48,19 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     meshes : sequence of (title, Mesh)
         One column each.
     means : sequence of (M,) float64
-        What each mesh's cells are filled with, in the image's own grey range.
+        Values that fill each mesh's cells, in the image's grey range.
 
     Returns
     -------
     Figure
         Three rows: edges over the image; cells filled with their means; E_D per mm^3 of each cell (the variance of
-        the image inside it) on one scale for all, so that a dark map is a good fit whatever the cells' sizes. Where a
-        mesh leaves the image uncovered, the lower rows are light blue.
+        the image inside it) on a common scale, so that a dark map is a good fit for any cell size. Where a mesh does
+        not cover the image, the lower rows are light blue.
 
     Raises
     ------
     InputError
-        No meshes, or another number of means than of meshes.
+        There are no meshes, or their number differs from that of means.
     """
     if not meshes or len(meshes) != len(means):
         raise InputError(f"slices_figure: expected one array of means for each mesh, got {len(means)}, {len(meshes)}")
@@ -97,9 +97,9 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
 
 
 def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path) -> None:
-    """PNG of every mesh, its right, front, upper octant taken away, cells in the grey of their means, with edges.
+    """Write a PNG of every mesh without its right, front, upper octant, with edges, cells in the grey of their means.
 
-    All are opened at the middle of the first mesh's box, up to three in a row. `means` as in `slices_figure`.
+    All are cut at the middle of the first mesh's box, up to three in a row. `means` as in `slices_figure`.
     """
     points = meshes[0][1].points
     centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -109,7 +109,7 @@ def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.floa
 
 
 def histograms_figure(report: Report) -> Figure:
-    """Fractions of cells by rho (left) and of dihedral angles (right), the pipelines' median runs over each other."""
+    """Plot fractions of cells by rho (left) and of dihedral angles (right) for the pipelines' median runs."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     panels = figure.subplots(1, 2)
     names = (
@@ -134,9 +134,9 @@ def histograms_figure(report: Report) -> Figure:
 
 
 def labels_figure(report: Report) -> Figure:
-    """Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, a mark a pipeline.
+    """Plot Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, by pipeline.
 
-    Medians over the runs; a label that is lost has Dice 0 and no distance. Labels stand in grey bars to hold on to.
+    Values are medians over the runs; a lost label has Dice 0 and no distance. Grey bars separate labels.
     """
     finished = _finished(report)
     voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
@@ -148,7 +148,7 @@ def labels_figure(report: Report) -> Figure:
             axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
         for place, (number, pipeline, run) in enumerate(finished):
             values = {row.label: getattr(row, name) for row in run.measurement.labels}
-            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not hide one another
+            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not overlap
             points = [(k + aside, values[label]) for k, label in enumerate(order) if values.get(label) is not None]
             axes.plot(
                 [x for x, _ in points], [y for _, y in points], linestyle="none", markersize=5, label=pipeline.title,
@@ -170,10 +170,10 @@ def labels_figure(report: Report) -> Figure:
 
 
 def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
-    """Errors by number of nodes, or by the seconds of a solve: a row for each Poisson's ratio, a column for each error.
+    """Plot errors by number of nodes, or by solve time: a row for each Poisson's ratio, a column for each error.
 
-    Logarithmic, with the average of moduli that is set; lines of quadratic cells are solid, of linear ones broken.
-    Without any finite-element result: E_D as a fraction of the image's variance by the number of nodes instead.
+    Axes are logarithmic, with the selected average of moduli; solid lines are quadratic cells, dashed lines linear
+    ones. Without any finite-element result, plot E_D as a fraction of the image's variance by number of nodes.
     """
     ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.fem}, key=float)
     rows = max(len(ratios), 1)
@@ -189,13 +189,13 @@ def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
         _draw_curves(grid[0, 0], report, lambda point: (point.n_nodes, point.E_D_fraction))
         grid[0, 0].set_ylabel("E_D, fraction of the image's variance")
     for axes in grid[-1]:
-        axes.set_xlabel("seconds of the processor, matrix and solve" if is_by_time and ratios else "nodes in all")
+        axes.set_xlabel("processor seconds, assembly and solve" if is_by_time and ratios else "nodes in all")
     _legend(figure, grid.ravel())
     return figure
 
 
 def curve_title(curve: Curve) -> str:
-    """What a line is called."""
+    """Return the label of a line."""
     return f"{curve.title}, {ORDER_WORDS[curve.order]}"
 
 
@@ -210,7 +210,7 @@ def _point_of_curve(report: Report, nu: str, name: str, is_by_time: bool) -> Cal
 
 
 def _draw_curves(axes: Axes, report: Report, place: Callable[[CurvePoint], Place]) -> None:
-    """One line a pipeline and order of cells, through `place(point)`; what has no logarithm is left out."""
+    """Draw a line per pipeline and order of cells, through `place(point)`; values without a logarithm are left out."""
     numbers = {pipeline.name: number for number, pipeline in enumerate(report.pipelines)}
     for curve in report.curves:
         places = [place(point) for point in curve.points]
@@ -237,9 +237,9 @@ def _draw_curves(axes: Axes, report: Report, place: Callable[[CurvePoint], Place
 
 
 def tradeoff_figure(report: Report) -> Figure:
-    """What each option of a graded mesh trades: E_D's fraction against mean rho, angles and, where simulated, errors.
+    """Plot the trade-offs of a graded mesh's options: E_D's fraction by mean rho, angles and, if simulated, errors.
 
-    A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
+    Each option is a line with its values, with a star at the defaults; other pipelines' medians are single points.
     """
     nus = sorted({nu for row in report.tradeoff for nu in row.measured.fem}, key=float)[:1]
     orders = sorted({row.order for row in report.tradeoff})
@@ -284,7 +284,7 @@ def _error(nu: str, average: str, name: str) -> Value:
 
 
 def _draw_tradeoff(axes: Axes, report: Report, order: int, value: Value, is_open: bool = False) -> None:
-    """A line through the meshes of each option, its values beside them; hollow and without words if open."""
+    """Draw a line through the meshes of each option, with its values; hollow and without text if open."""
     of_order = [row for row in report.tradeoff if row.order == order]
     options = list(dict.fromkeys(row.option for row in of_order))
     for number, option in enumerate(options):
@@ -317,7 +317,7 @@ def _annotate(axes: Axes, text: str, point: tuple[Any, Any], offset: tuple[int, 
 
 
 def timing_figure(report: Report) -> Figure:
-    """Wall seconds of each pipeline's median run as a bar, stacked by step; a failed pipeline's bar is the word."""
+    """Plot wall seconds of each pipeline's median run as a bar, stacked by step; failed pipelines have a text."""
     timed = [
         {} if pipeline.median is None else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED_STEPS}
         for pipeline in report.pipelines
@@ -339,7 +339,7 @@ def timing_figure(report: Report) -> Figure:
             left += seconds
         axes.text(left, row, f" {pipeline.median.seconds_total:.3g} s", va="center", fontsize=10)
     axes.set_yticks(range(len(timed)), [pipeline.title for pipeline in report.pipelines])
-    axes.set_ylim(len(timed) - 0.4, -0.6)  # the first on top
+    axes.set_ylim(len(timed) - 0.4, -0.6)  # the first at the top
     axes.margins(x=0.12)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("wall seconds, median run")
@@ -349,7 +349,7 @@ def timing_figure(report: Report) -> Figure:
 
 
 def _finished(report: Report) -> list[tuple[int, PipelineResult, PipelineRun]]:
-    """The pipelines with a mesh: their places in the list, which give them their colours, and their median runs."""
+    """Return the pipelines with a mesh: their places in the list, which select colours, and their median runs."""
     return [(number, each, each.median) for number, each in enumerate(report.pipelines) if each.median is not None]
 
 
@@ -358,7 +358,7 @@ def _style(number: int) -> dict[str, Any]:
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One legend above all panels, each label once."""
+    """Add one legend above all panels, with each label once."""
     handles = {
         label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }

@@ -1,4 +1,4 @@
-"""The comparison from files to files: `report.json`, the pictures and `report.html` made from it."""
+"""The comparison from files to files: `report.json`, and the pictures and `report.html` from it."""
 
 from __future__ import annotations
 
@@ -38,16 +38,14 @@ from tetopt.system.files import results_folder, save_json
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {
     "slices.png": "The same slice through every mesh; the mean of the image in each cell; E_D of each cell",
-    "quadratic.png": "The same slice through the coarser meshes whose quadratic cells have as many nodes in all",
-    "cutaways.png": "Cut open, cells in the grey of their mean",
+    "quadratic.png": "The same slice through the coarser meshes whose quadratic cells have as many nodes in total",
+    "cutaways.png": "Cutaways, cells in the grey of their mean",
     "labels.png": "Every label, by size: Dice, and mean distance between its surfaces in mesh and image; lost labels "
     "have Dice 0 and no distance",
     "histograms.png": "Radius ratio rho and dihedral angles",
-    "curves.png": "Error of the compression test against the number of nodes, those in the middle of the edges of "
-    "quadratic cells counted",
-    "solve_time.png": "The same against the seconds that the processor takes for the matrix and the solve, by the same "
-    "multigrid for all",
-    "tradeoff.png": "What tetopt's options trade, one at a time around the defaults (star), on the image alone: E_D "
+    "curves.png": "Error of the compression test by number of nodes, including mid-edge nodes of quadratic cells",
+    "solve_time.png": "The same by processor seconds for assembly and solve, with the same multigrid for all",
+    "tradeoff.png": "Trade-offs of tetopt's options, one at a time around the defaults (star), on the image alone: E_D "
     "against shape, the smallest and the 1st percentile of the dihedral angles, and the errors of the compression test",
     "timing.png": "Seconds by step",
 }
@@ -57,16 +55,16 @@ COMPARE_FILES = ("report.json", "report.html", *COMPARE_PICTURES)
 def compare_image(
     image_path: Path, output: Path, options: CompareOptions, command: str, *, resume: bool = False, force: bool = False
 ) -> Report:
-    """Compare, write the files `COMPARE_FILES` into a folder, return what `report.json` holds.
+    """Compare, write the files `COMPARE_FILES` into a folder, and return the content of `report.json`.
 
-    Notes tell what is done; `tetopt.job.events.listened` names who gets them.
+    Notes report the progress to the listener of `tetopt.job.events.listened`.
 
     Parameters
     ----------
     image_path, output : Path
     options : CompareOptions
     command : str
-        What the report says to run it again.
+        Command that the report states for running it again.
     resume : bool
         Keep finished runs of the same image, settings and versions.
     force : bool
@@ -75,8 +73,8 @@ def compare_image(
     Raises
     ------
     InputError
-        Options that contradict each other, files that cannot be read or written, not a volume, labels of another
-        shape, pipelines that do not exist, or every pipeline failed.
+        Options contradict each other; files cannot be read or written; the image is no volume; labels have another
+        shape; pipelines do not exist, or all failed.
     """
     settings = options.settings()
     image, labels = image_and_labels(image_path, options.labels, options.part)
@@ -88,7 +86,7 @@ def compare_image(
     comparison = compare.Comparison(image, labels, mapping, settings, source, of_labels, words, command)
     paths = checked_outputs(results_folder(output), COMPARE_FILES, force or resume)
     if (output / "runs").is_dir() and not (resume or force):
-        raise InputError(f"{output / 'runs'}: finished runs are there; `resume` keeps them, `force` starts over")
+        raise InputError(f"{output / 'runs'}: contains finished runs; `resume` keeps them, `force` starts over")
     names, known = set(settings.pipelines), pipelines_with(settings.programs)
     if not names or not names <= set(known) or len(names) < len(settings.pipelines):
         raise InputError(
@@ -98,17 +96,17 @@ def compare_image(
     report, meshes = compare.run(output, comparison, classes, resume=resume)
     if not meshes[1]:
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)
-        raise InputError(f"compare: every pipeline failed, nothing is reported: {how}")
+        raise InputError(f"compare: all pipelines failed, so there is no report: {how}")
     save_json(paths["report.json"], as_json(report) | {"headline": as_json(headline(report))})
-    note("pictures and page")
+    note("writing pictures and page")
     _draw(paths, report, image, meshes)
     return report
 
 
 def _label_source(path: Path | None, labels: Image | None, names: Path | None) -> LabelSource | None:
-    """The labels' file, and what those in it are called; InputError for names of labels that there are not."""
+    """Return the labels' file with their names; raise InputError for names without labels."""
     if names is not None and labels is None:
-        raise InputError("`label_names`: there are no `labels`")
+        raise InputError("`label_names`: needs `labels`")
     if path is None or labels is None:
         return None
     there = table_of_labels(label_table(names), np.unique(labels.data).astype(np.int64).tolist())
@@ -133,7 +131,7 @@ def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[int
     if report.tradeoff:
         figures["tradeoff.png"] = tradeoff_figure(report)
     drawn = {"cutaways.png", *figures}
-    for name in set(COMPARE_PICTURES) - drawn:  # what lies there is of the report that this one replaces
+    for name in set(COMPARE_PICTURES) - drawn:  # existing ones belong to the report that this one replaces
         paths[name].unlink(missing_ok=True)
     for name, figure in figures.items():
         save_figure(figure, paths[name])

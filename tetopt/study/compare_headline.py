@@ -1,6 +1,6 @@
-"""What a comparison comes to: tetopt against the best peer in a handful of numbers, and where it is behind.
+"""Headline of a comparison: tetopt against the best peer in a few numbers, and where it is behind.
 
-The same for the page, the terminal and report.json.
+It is the same on the page, in the terminal and in report.json.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from tetopt.study.compare_criteria import (
 )
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, PipelineResult, Report
 
-SIZE_TOLERANCE = 1.1  # meshes whose numbers of nodes differ by a larger factor are not compared without a word
+SIZE_TOLERANCE = 1.1  # a larger factor between numbers of nodes is remarked
 
 Verdict = Literal["better", "worse", "no different", "no verdict"]
 
 
 class Claim(NamedTuple):
-    """A measure of tetopt's mesh beside that of another."""
+    """A measure of tetopt's mesh and that of another."""
 
     group: str
     measure: str
@@ -40,27 +40,27 @@ class Claim(NamedTuple):
     other: CriterionEntry
     other_title: str
     other_kind: str  # "peer", "control", or "tetopt" for another of its own meshes
-    ratio: float | None  # tetopt's over the other's; None where one is 0 or missing
+    ratio: float | None  # tetopt's over the other's; None if one is 0 or missing
     verdict: Verdict  # on tetopt; "no different" within the runs' ranges, or by less than `EQUAL_FRACTION`
-    beside: list[str]  # what a reader must know with it: why there is no verdict, the reference's own change, nodes
-    own_change: float | None  # of the reference from its half resolution; None if not known, and for other measures
-    blind: str  # what the measure does not see
+    beside: list[str]  # context: why there is no verdict, the reference's own change, nodes
+    own_change: float | None  # of the reference from its half resolution; None if unknown, and for other measures
+    blind: str  # what the measure does not capture
 
     @property
     def factor(self) -> float:
-        """By how much the two differ, from 1 on."""
+        """Factor by which the two differ, at least 1."""
         return math.inf if self.ratio is None else max(self.ratio, 1.0 / self.ratio)
 
     @property
     def is_lost(self) -> bool:
-        """Whether tetopt's number is the worse one, by however little."""
+        """True if tetopt's number is worse, by any amount."""
         if self.ours.value is None or self.other.value is None:
             return self.ours.value is None
         return self.ours.value > self.other.value if self.smaller_is_better else self.ours.value < self.other.value
 
     @property
     def ratio_words(self) -> str:
-        """The ratio to three digits, or the difference where there is none."""
+        """The ratio to three digits, or the difference if there is no ratio."""
         if self.ratio is not None:
             return ratio_text(self.ratio)
         if self.ours.value is None or self.other.value is None:
@@ -69,24 +69,24 @@ class Claim(NamedTuple):
 
 
 class Headline(NamedTuple):
-    """What is read first."""
+    """The first section of the page."""
 
-    title: str  # who is compared with whom, and who could not be
+    title: str  # the compared pipelines, and those that failed
     remarks: list[str]  # numbers of nodes, and of runs
     claims: list[Claim]  # tetopt against the best peer of each measure
-    behind: list[Claim]  # all measures but details in which another mesh is better, group by group, the worst first
+    behind: list[Claim]  # measures, except details, in which another mesh is better, by group, the worst first
 
     def behind_peers(self) -> list[Claim]:
-        """Where a peer is better."""
+        """Claims in which a peer is better."""
         return [claim for claim in self.behind if claim.other_kind == "peer"]
 
     def behind_others(self) -> list[Claim]:
-        """Where a control is, or another of tetopt's own meshes."""
+        """Claims in which a control, or another of tetopt's own meshes, is better."""
         return [claim for claim in self.behind if claim.other_kind != "peer"]
 
 
 def headline(report: Report) -> Headline:
-    """What the comparison comes to."""
+    """Return the headline of a comparison."""
     ours = our_place(report)
     peers = [place for place, each in enumerate(report.pipelines) if each.kind == "peer" and each.median is not None]
     title, remarks = _title(report, ours, peers), _remarks(report, ours, peers)
@@ -98,7 +98,7 @@ def headline(report: Report) -> Headline:
     every = [
         claim
         for row in rows
-        for places in (peers, others if row.group != "Cost" else [])  # what makes no mesh of an image costs nothing
+        for places in (peers, others if row.group != "Cost" else [])  # pipelines that ignore the image cost nothing
         for claim in _claims(report, row, ours, places)
     ]
     behind = [claim for claim in every if claim.verdict == "worse"]
@@ -107,13 +107,13 @@ def headline(report: Report) -> Headline:
 
 
 def our_place(report: Report) -> int | None:
-    """Which of the pipelines the headline is of: tetopt by its defaults, else the first of its meshes."""
+    """Return the pipeline of the headline: tetopt with its defaults, else the first of its meshes."""
     done = [place for place, each in enumerate(report.pipelines) if each.kind == "tetopt" and each.median is not None]
     return min(done, key=lambda place: report.pipelines[place].name != "tetopt", default=None)
 
 
 def _claims(report: Report, row: Criterion, ours: int, places: list[int]) -> Iterator[Claim]:
-    """Of one measure, against the best of the meshes at these places; nothing if none has a value."""
+    """Yield the claim on one measure, against the best mesh at these places, if any has a value."""
     entries = entries_of(row, report)
     known = [place for place in places if entries[place].value is not None]
     if not known:
@@ -135,9 +135,9 @@ def _claims(report: Report, row: Criterion, ours: int, places: list[int]) -> Ite
 
 
 def _beside(row: Criterion, pipelines: list[PipelineResult], places: tuple[int, int], why: str) -> list[str]:
-    """What stands beside a claim: why it has no verdict, what is known of the reference, both numbers of nodes."""
+    """Return the context of a claim: why it has no verdict, the reference's own change, both numbers of nodes."""
     words = [why] if why else []
-    if row.is_error and not why:  # which says it
+    if row.is_error and not why:  # which states it
         change = "not known" if row.own_change is None else short_text(row.own_change)
         words.append(f"reference's own change {change}")
     nodes = [number_text(each.n_nodes) for place in places if (each := _measured(pipelines[place])) is not None]
@@ -151,21 +151,21 @@ def _measured(pipeline: PipelineResult) -> Measurement | None:
 
 
 def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
-    """Where a peer's number is the better one, and it does not count: so that no loss goes unsaid."""
+    """Yield a remark on peers' better numbers without a verdict, so that every loss is stated."""
     lost = [
         f"{claim.measure} ({claim.ratio_words}, {claim.beside[0]})"
         for claim in claims
         if claim.verdict == "no verdict" and claim.other_kind == "peer" and claim.is_lost
     ]
     if lost:
-        yield f"A peer's number is the better one, without a verdict: {'; '.join(lost)}."
+        yield f"A peer's number is better, without a verdict: {'; '.join(lost)}."
 
 
 def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verdict:
-    if own.known is None or other.known is None:  # the other is there: a claim is against a mesh with a value
+    if own.known is None or other.known is None:  # the other is known: a claim is against a mesh with a value
         return "worse"
     (value, low, high), (others, lowest, highest) = own.known, other.known
-    if row.is_timed and low == high and others > 0.0:  # of one run: it scatters like the other's, at the least
+    if row.is_timed and low == high and others > 0.0:  # of one run: it scatters at least like the other's
         low, high = (value * each / others for each in (lowest, highest))
     is_near = abs(value - others) <= EQUAL_FRACTION * max(abs(value), abs(others))
     best = winners(row.better, [value, others])
@@ -175,10 +175,10 @@ def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verd
 
 
 def failure_words(each: PipelineResult) -> str:
-    """That a pipeline failed, or that it is not installed."""
+    """Describe a failed pipeline, or one that is not installed."""
     if each.reason == "missing":
         return f"{each.title} is not installed"
-    is_crash = each.reason == "crash"  # which was run again
+    is_crash = each.reason == "crash"  # and was run again
     how = (each.failure or "no run").removeprefix("twice ").removeprefix("crashed: ") if is_crash else each.failure
     return f"{each.title} failed{' twice' if is_crash else ''} ({how})"
 
@@ -188,10 +188,10 @@ def _title(report: Report, ours: int | None, peers: list[int]) -> str:
     void = [failure_words(each) for each in tried if each.median is None]
     if ours is None:
         failed = [failure_words(each) for each in report.pipelines if each.kind == "tetopt"]
-        return f"nothing of tetopt's to compare: {'; '.join(failed) or 'none of its pipelines was asked for'}"
+        return f"no mesh of tetopt's to compare: {'; '.join(failed) or 'none of its pipelines was requested'}"
     title = report.pipelines[ours].title
     if not peers:
-        return f"{title} against no peer: {'; '.join(void) or 'none was asked for'}"
+        return f"{title} against no peer: {'; '.join(void) or 'none was requested'}"
     names = " and ".join(report.pipelines[place].title for place in peers)
     return "; ".join([f"{title} against {names} at {report.options.nodes} nodes", *void])
 
@@ -205,15 +205,15 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
         if sizes:
             counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in sizes.items())
             is_equal = max(sizes.values()) <= SIZE_TOLERANCE * min(sizes.values())
-            more = "" if is_equal else "; more nodes alone make E_D and the errors smaller, see the curves"
+            more = "" if is_equal else "; more nodes alone reduce E_D and the errors, see the curves"
             remarks.append(f"{'Nodes' if is_equal else 'The meshes differ in nodes'}, {word} cells: {counts}{more}.")
     if places:
         runs = ", ".join(f"{report.pipelines[place].title} {len(report.pipelines[place].runs)}" for place in places)
         remarks.append(
-            f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges counts as none, "
-            f"nor does one below {EQUAL_FRACTION:.1%}; of one run no range is known. An error has no "
-            "verdict where the meshes differ by less than the reference does from its own half resolution, nor have "
-            "time and memory of one run each."
+            f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges, or below "
+            f"{EQUAL_FRACTION:.1%}, does not count; a single run has no range. An error has no verdict if the "
+            "meshes differ by less than the reference does from its own half resolution; nor have time and memory "
+            "of single runs."
         )
     for order, word in ORDER_WORDS.items():
         for each in of_order(report, order):

@@ -1,4 +1,4 @@
-"""The labels' section of the comparison's page: who keeps them, which vanished, and a row for each."""
+"""The labels' section of the comparison's page: fidelity, lost labels, and a row for each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from tetopt.study.compare_criteria import judged_labels, number_text, volume_error, voxels_by_label, which_labels
 from tetopt.study.compare_report import PipelineResult, Report
 
-# Of `LabelRow`: what is shown of each label, besides the error of its volume.
+# Fields of `LabelRow` to show for each label, besides its volume error.
 SHOWN_FIELDS = (
     "dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_fraction", "area_ratio", "folded",
     "one_layer_fraction", "excess_contact_mm2",
@@ -18,7 +18,7 @@ SHOWN_FIELDS = (
 
 
 def _label_medians(pipeline: PipelineResult, label: int) -> dict[str, Any]:
-    """What a pipeline's runs make of a label: medians, None where no run has a value; runs in which it is lost."""
+    """Return a pipeline's results for a label: medians, None if no run has a value; number of runs that lose it."""
     rows = [row for run in pipeline.runs for row in run.measurement.labels if row.label == label]
     values = {name: [getattr(row, name) for row in rows] for name in SHOWN_FIELDS}
     values["volume_error"] = [volume_error(row) for row in rows]
@@ -37,7 +37,7 @@ class LabelLine(NamedTuple):
 
 
 def labels_of(report: Report) -> dict[str, Any] | None:
-    """What the section shows, by the names that its template has for it; None without labels."""
+    """Return the section's content, by the names in its template; None without labels."""
     done = [pipeline for pipeline in report.pipelines if pipeline.median is not None]
     lines = [
         LabelLine(label, _label_words(report, label), n_voxels, [_label_medians(pipeline, label) for pipeline in done])
@@ -54,7 +54,7 @@ def labels_of(report: Report) -> dict[str, Any] | None:
     titles = [pipeline.title for pipeline in done]
     return {
         "done": done,  # with a mesh
-        "first": titles[first],  # by whose Dice labels are ordered
+        "first": titles[first],  # its Dice orders the labels
         "worst_first": sorted(lines, key=lambda line: (line.medians[first]["dice"] or 0.0, line.voxels)),
         "verdicts": [_verdict(own, peer, report) for own in ours for peer in peers] if judged else [],
         "which": which_labels(report),
@@ -77,7 +77,7 @@ def _label_words(report: Report, label: int) -> str:
 
 
 def _verdict(ours: PipelineResult, peer: PipelineResult, report: Report) -> dict[str, Any]:
-    """tetopt's mesh beside a peer's: labels with a lower Dice, the worst first, and those with a larger distance."""
+    """Compare tetopt's mesh with a peer's: labels with lower Dice, the worst first, and those with larger distance."""
     pairs = {label: (_label_medians(ours, label), _label_medians(peer, label)) for label in judged_labels(report)}
     dice = [(round(a["dice"] or 0.0, 4), round(b["dice"] or 0.0, 4), label) for label, (a, b) in pairs.items()]
     worse = sorted((row for row in dice if row[0] < row[1]), key=lambda row: row[0] - row[1])
@@ -92,5 +92,5 @@ def _verdict(ours: PipelineResult, peer: PipelineResult, report: Report) -> dict
 
 
 def _is_farther(value: float | None, other: float | None) -> bool:
-    """Whether a distance is above another; where there is no surface it is above all others."""
+    """Return whether a distance exceeds another; without a surface it exceeds all others."""
     return other is not None and (value is None or value > other)

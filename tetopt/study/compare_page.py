@@ -1,6 +1,6 @@
-"""The page of `tetopt compare`: report.json rendered: what matters, each group of measures, its origin.
+"""The page of `tetopt compare`, rendered from report.json: headline, each group of measures, provenance.
 
-The words are in `compare.html`, and in `compare_parts.html` and `compare_labels.html`, which it uses.
+The text is in `compare.html`, and in `compare_parts.html` and `compare_labels.html`, which it includes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tetopt.study.compare_report import ORDER_WORDS, Curve, PipelineResult, Repo
 from tetopt.study.pipelines import UNTIMED_STEPS
 
 ARROWS = {-1: " ↓", 1: " ↑", 0: ""}
-GROUP_PICTURES = {  # by the stems of their names, in the sections of their groups
+GROUP_PICTURES = {  # stems of pictures' names, by the group of their section
     "Image": ("slices", "quadratic", "cutaways"),
     "Labels": ("labels",),
     "Shape": ("histograms",),
@@ -54,12 +54,12 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
     ----------
     path : Path
     report : Report
-        What `report.json` holds; every number on the page is one of these, rounded to four digits, or computed from
-        them, and nothing is measured here.
+        Content of `report.json`; every number on the page is one of its numbers, rounded to four digits, or computed
+        from them, and nothing is measured here.
     pictures : sequence of (PNG path, caption)
-        Each stands in the section that `GROUP_PICTURES` has it in.
+        Each is shown in its section of `GROUP_PICTURES`.
     views : sequence of View
-        Surfaces to turn; without any, the section is left out.
+        Surfaces to rotate; without any, the section is left out.
     """
     content = rendered(
         "study/compare.html", report=report, first=headline(report), nus=fem_ratios(report), order_words=ORDER_WORDS,
@@ -77,7 +77,7 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
 
 
 def _numbered(content: str) -> Markup:
-    """The page with numbers before the captions, to cite them by; those that are folded away count, too."""
+    """Number the captions of the page for citation, including folded ones."""
     for tag, word in (("caption", "Table"), ("figcaption", "Figure")):
         numbers = count(1)
         content = re.sub(f"<{tag}>", lambda match: f"{match[0]}{word} {next(numbers)}. ", content)  # noqa: B023
@@ -85,7 +85,7 @@ def _numbered(content: str) -> Markup:
 
 
 class MeasureCell(NamedTuple):
-    """What a pipeline has for a measure."""
+    """A pipeline's entry for a measure."""
 
     pipeline: PipelineResult
     entry: CriterionEntry
@@ -96,13 +96,13 @@ class MeasureCell(NamedTuple):
 class MeasureRow(NamedTuple):
     """A measure of all pipelines."""
 
-    part: str  # the heading before it, "" where it is the one of the row above
+    part: str  # the heading before it, "" if it is that of the row above
     title: str
     cells: list[MeasureCell]
 
 
 def _group(report: Report, name: str) -> dict[str, Any]:
-    """A section of measures: its rows, those that are folded away, and what each does not see."""
+    """Return a section of measures: its rows, the folded ones, and what each does not capture."""
     rows = [row for row in criteria(report) if row.group == name]
     blind = dict.fromkeys((row.title, row.blind) for row in rows if row.blind)
     shown, details = (
@@ -112,7 +112,7 @@ def _group(report: Report, name: str) -> dict[str, Any]:
 
 
 def measure_rows(report: Report, rows: Sequence[Criterion]) -> list[MeasureRow]:
-    """The rows of a table of these measures; none for those that no pipeline has."""
+    """Return the rows of a table of these measures; none for those that no pipeline has."""
     lines, part = [], None
     for row in rows:
         entries = entries_of(row, report)
@@ -140,7 +140,7 @@ def _cells(row: Criterion, report: Report, entries: Sequence[CriterionEntry]) ->
 
 
 def _open_win(row: Criterion, report: Report, entries: Sequence[CriterionEntry], best: Sequence[int]) -> str:
-    """Why the best value of a row is no verdict over the one after it; "" where it is one, or shared."""
+    """Return why the best value of a row has no verdict over the next; "" if it has one, or is shared."""
     others = [place for place, each in enumerate(entries) if each.value is not None and place not in best]
     if len(best) != 1 or not others:
         return ""
@@ -149,7 +149,7 @@ def _open_win(row: Criterion, report: Report, entries: Sequence[CriterionEntry],
 
 
 class Variant(NamedTuple):
-    """How a mesh is solved, and the error that comes of it."""
+    """A way to solve a mesh, and its error."""
 
     pipeline: PipelineResult
     order: int
@@ -158,7 +158,7 @@ class Variant(NamedTuple):
 
 
 def _variants(report: Report, nu: str, name: str) -> list[Variant]:
-    """Every pipeline with every order and average, the smallest error first."""
+    """Return every pipeline with every order and average, the smallest error first."""
     rows = [
         Variant(pipeline, order, average, value)
         for order in ORDER_WORDS
@@ -170,7 +170,7 @@ def _variants(report: Report, nu: str, name: str) -> list[Variant]:
 
 
 def _best_variants(report: Report) -> Iterator[tuple[str, Variant, float | None, list[Variant]]]:
-    """For each Poisson's ratio the mesh, cells and moduli of the best displacement, its energy's error, and others.
+    """Yield, for each Poisson's ratio, mesh, cells and moduli of the best displacement, its energy error, and others.
 
     The others are the best with cells of the other order, and of each pipeline of another kind.
     """
@@ -188,7 +188,7 @@ def _best_variants(report: Report) -> Iterator[tuple[str, Variant, float | None,
 
 
 def equal_times(report: Report) -> list[list[str]]:
-    """Rows of pipeline, nu, seconds of the linear mesh's solve, its displacement error and the quadratic one then."""
+    """Return rows of pipeline, nu, solve seconds of the linear mesh, its displacement error and the quadratic one."""
     curves = {(curve.name, curve.order): curve for curve in report.curves}
     rows = []
     for pipeline in report.pipelines:
@@ -204,7 +204,7 @@ def equal_times(report: Report) -> list[list[str]]:
 
 
 def _error_at(curve: Curve, nu: str, average: str, seconds: float) -> float | None:
-    """The displacement's error on a curve at a time between those of two of its meshes; None beyond them."""
+    """Interpolate the displacement error on a curve at a time between two of its meshes; None beyond them."""
     solved = [point.fem[nu].averages[average] for point in curve.points if nu in point.fem]
     points = sorted((each.seconds, each.errors.displacement) for each in solved if each.errors.displacement)
     if not points or not points[0][0] <= seconds <= points[-1][0]:
@@ -214,7 +214,7 @@ def _error_at(curve: Curve, nu: str, average: str, seconds: float) -> float | No
 
 
 def _text(value: Any, between: str = ", ") -> str:
-    """Any setting as text, sequences joined."""
+    """Format any setting as text, with sequences joined."""
     if isinstance(value, list | tuple):
         return between.join(_text(item) for item in value) or "none"
     if isinstance(value, bool) or not isinstance(value, int | float):

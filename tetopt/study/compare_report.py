@@ -1,4 +1,4 @@
-"""What `report.json` and the files in `runs` hold, as records: written as objects, and read back when resuming."""
+"""Records of `report.json` and the files in `runs`: written as objects, and read back when resuming."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
 
-# The files are flatter than the records: the keys of these fields' values stand beside those of the record itself,
+# The files are flatter than the records: the keys of these fields' values are beside those of the record itself,
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
 # and these fields are left out where they are None.
 OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")
@@ -21,28 +21,28 @@ ORDER_WORDS = {1: "linear", 2: "quadratic"}
 
 
 class Settings(NamedTuple):
-    """What is compared and how; all of it is in the report."""
+    """Settings of a comparison, all of which are in the report."""
 
     nodes: int
     pipelines: tuple[str, ...] = tuple(PIPELINES)
-    programs: tuple[Program, ...] = ()  # of the user's own, among the pipelines by their names
+    programs: tuple[Program, ...] = ()  # the user's own, among the pipelines by name
     repeats: int = 3  # of pipelines whose result changes from run to run
     classes: int = OTSU_CLASSES  # of the multi-Otsu segmentation, without labels
     k_D: float = UNIFORM_K_D
     iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
-    average: str = DEFAULT_AVERAGE  # of a cell's moduli, beside Eq. (2)'s mean
-    reference_dofs: int | None = None  # the voxel grid is averaged until it has no more; in a report what was chosen
-    reference_seconds: float = 120.0  # that it may take without such a number, for all of `nus`
-    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
+    average: str = DEFAULT_AVERAGE  # of a cell's moduli, in addition to Eq. (2)'s mean
+    reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
+    reference_seconds: float = 120.0  # time limit of the reference without `reference_dofs`, for all of `nus`
+    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, over `nodes`, in addition to 1
     tradeoff: bool = False  # whether tetopt's options are swept around its defaults
     max_seconds: float = 3600.0  # of one run of a pipeline
-    max_bytes: int | None = None  # likewise, resident
+    max_bytes: int | None = None  # of one run, resident
 
 
 class ImageSource(NamedTuple):
-    """The file that is meshed, and the part of it."""
+    """The file that is meshed, and its selected part."""
 
     name: str
     sha256: str
@@ -56,10 +56,10 @@ class LabelSource(NamedTuple):
     name: str
     kind: str  # "given"
     sha256: str
-    names: dict[int, str] = {}  # noqa: RUF012 - nobody changes it; of the labels in the image that have one
+    names: dict[int, str] = {}  # noqa: RUF012 - never modified; of the labels in the image that have one
 
     def words(self, label: int) -> str:
-        """A label with its name, if it has one."""
+        """Return a label with its name, if it has one."""
         return f"{label} {self.names.get(label, '')}".rstrip()
 
 
@@ -71,9 +71,9 @@ class Histogram(NamedTuple):
 
 
 class LabelRow(NamedTuple):
-    """What a mesh makes of one label, its voxels painted by the cells, and what its surface is like.
+    """Fidelity of a mesh to one label, by voxels painted by the cells, and measures of the label's surface.
 
-    As `tetopt.measure.fidelity.LabelFidelity` and `tetopt.measure.interfaces.LabelInterface` have it.
+    As in `tetopt.measure.fidelity.LabelFidelity` and `tetopt.measure.interfaces.LabelInterface`.
     """
 
     label: int
@@ -84,24 +84,24 @@ class LabelRow(NamedTuple):
     is_lost: bool
     volume_mm3: float
     mesh_volume_mm3: float
-    surface_mean_mm: float | None  # None where the label has no surface in the mesh
+    surface_mean_mm: float | None  # None if the label has no surface in the mesh
     surface_p95_mm: float | None
     components: int
     mesh_components: int
-    area_ratio: float | None  # of its surface over that of its voxels smoothed; None where it has none, as the next
+    area_ratio: float | None  # of its surface over that of its smoothed voxels; None without a surface, as the next
     folded: float | None
     nonmanifold_edges: int
     nonmanifold_edges_two_labels: int
-    one_layer_fraction: float | None  # None where no cell has it
+    one_layer_fraction: float | None  # None if no cell has it
     excess_contact_mm2: float  # with all other labels, over 1.2 times the voxels'
 
 
 class Solved(NamedTuple):
-    """The compression of a mesh with one average of the moduli, and how far it is from the reference."""
+    """The compression of a mesh with one average of the moduli, and its errors against the reference."""
 
     strain_energy: float  # uJ
     errors: Errors
-    seconds: float  # of the processor, to assemble the matrix and to solve; the moduli and the errors not counted
+    seconds: float  # of the processor, for assembly and solve, without moduli and errors
 
 
 class Simulation(NamedTuple):
@@ -114,10 +114,10 @@ class Simulation(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Everything that is compared of a mesh, with cells of one order."""
+    """All measures of a mesh, with cells of one order."""
 
     order: int  # 1: linear cells, 2: quadratic ones
-    n_nodes: int  # in all: those in the middle of edges, which quadratic cells have, too
+    n_nodes: int  # in total, including mid-edge nodes of quadratic cells
     n_corners: int  # the mesh's own
     n_cells: int
     E_D: float
@@ -133,7 +133,7 @@ class Measurement(NamedTuple):
 
 
 class PipelineRun(NamedTuple):
-    """One execution of a pipeline that ended with a mesh; also the median, lowest or highest of several, by number."""
+    """One execution of a pipeline that gave a mesh; also the median, lowest or highest of several, by number."""
 
     seconds: dict[str, float]  # by step
     seconds_total: float
@@ -142,14 +142,14 @@ class PipelineRun(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """What a file in `runs` holds."""
+    """Content of a file in `runs`."""
 
     key: str  # of all that the numbers depend on
     failure: str | None
     notes: list[str]
     run: PipelineRun | None  # None after a failure
     reason: str | None = None  # of the failure, as `tetopt.study.child.Reason`
-    crashes: list[str] = []  # noqa: RUF012 - nobody changes it; of the run and of the one that it repeats
+    crashes: list[str] = []  # noqa: RUF012 - never modified; of the run and of the one it repeats
     mesh_file_sha256: str | None = None
 
 
@@ -162,10 +162,10 @@ class PipelineResult(NamedTuple):
     about: str
     failure: str | None  # the first, if a run failed
     reason: str | None  # of it, as `tetopt.study.child.Reason`
-    crashes: list[str]  # of all runs; each was run once more
+    crashes: list[str]  # of all runs; each run was repeated once
     notes: list[str]
     runs: list[PipelineRun]
-    median: PipelineRun | None = None  # None if no run ended with a mesh, as for the next two
+    median: PipelineRun | None = None  # None if no run gave a mesh, as for the next two
     low: PipelineRun | None = None
     high: PipelineRun | None = None
 
@@ -207,7 +207,7 @@ class ImageFacts(NamedTuple):
 
 
 class ReferenceEnergy(NamedTuple):
-    """What the reference finds for one Poisson's ratio."""
+    """The reference's result for one Poisson's ratio."""
 
     strain_energy: float  # uJ
     own_error: OwnError  # of the solution at half the resolution against it
@@ -224,7 +224,7 @@ class ReferenceGrid(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What `report.json` holds."""
+    """Content of `report.json`."""
 
     command: str
     image: ImageFacts
@@ -235,20 +235,20 @@ class Report(NamedTuple):
     date: str  # on which the comparison ended, UTC
     options: Settings
     reference: ReferenceGrid
-    pipelines: list[PipelineResult]  # meshes of so many nodes, with linear cells
-    quadratic: list[PipelineResult]  # the same pipelines' coarser meshes, with quadratic cells, as many nodes in all
+    pipelines: list[PipelineResult]  # meshes of the requested number of nodes, with linear cells
+    quadratic: list[PipelineResult]  # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
     tradeoff: list[TradeoffRow]
     curves: list[Curve]
     seconds: float
 
 
 def averages_of(settings: Settings) -> tuple[str, ...]:
-    """The averages of moduli that every mesh is solved with: Eq. (2)'s, and the one that is set."""
+    """Return the averages of moduli for every mesh: Eq. (2)'s, and the selected one."""
     return tuple(dict.fromkeys(("mean", settings.average)))
 
 
 def as_json(value: Any) -> Any:
-    """A record as its file holds it, for `tetopt.system.files.save_json`: objects, lists and what these hold."""
+    """Convert a record to objects and lists, for `tetopt.system.files.save_json`."""
     if isinstance(value, dict):
         return {key: as_json(item) for key, item in value.items()}
     if hasattr(value, "_asdict"):
@@ -263,7 +263,7 @@ def as_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any) -> Any:
-    """What `as_json` made of a value of the type `kind`; KeyError, TypeError or AttributeError for anything else."""
+    """Restore a value of the type `kind` from `as_json`; raise KeyError, TypeError or AttributeError otherwise."""
     arguments = get_args(kind)
     if value is None:
         return None

@@ -1,6 +1,6 @@
-"""Interfaces between the classes of an image, cleaned for a mesher of surfaces, in the closed box of the image.
+"""Interfaces between the classes of an image, cleaned for a surface mesher, in the closed box of the image.
 
-Everything here lives in the *box frame*: x = index * spacing, in mm, in which the box is axis-aligned, from
+All coordinates are in the *box frame*: x = index * spacing, in mm, in which the box is axis-aligned, from
 -spacing/2 to (shape - 1/2) * spacing. Without shear in the affine, lengths and angles are those of the world. A
 sheared image is treated in the same frame and mapped by its affine afterwards, so its cells are sheared along.
 """
@@ -19,13 +19,13 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 
-OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
-SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
-SPECK_AREA = 3.0  # pieces of surface with less than this many size^2 are dropped: no cell of that size shows them
-EDGE_FRACTION = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
-SINC_ITERATIONS = 30  # of the smoothing; VTK's default is 20, and a narrower pass band takes more
-PASS_BAND = 0.05  # of the same; VTK's default is 0.1, and less is smoother
-PAD_VOXELS = 4  # by which the volume is continued, so that neither smoothing nor decimation frays at the box's faces
+OTSU_CLASSES = 4  # of the segmentation without labels: fewer lose interfaces (see `tetopt.study.tetwild`)
+SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: removes noise, moves no interface wider than a voxel
+SPECK_AREA = 3.0  # pieces of surface below this many size^2 are dropped: cells of that size cannot represent them
+EDGE_FRACTION = 0.7  # of a surface triangle over `size`; coarser ones round off folds, finer ones only take time
+SINC_ITERATIONS = 30  # of the smoothing; VTK's default is 20, and a narrower pass band needs more
+PASS_BAND = 0.05  # of the smoothing; VTK's default is 0.1, and less is smoother
+PAD_VOXELS = 4  # padding of the volume, so that smoothing and decimation do not fray at the box's faces
 
 
 class Surfaces(NamedTuple):
@@ -33,19 +33,19 @@ class Surfaces(NamedTuple):
 
     points: NDArray[np.float64]  # (P, 3) mm
     triangles: NDArray[np.int64]  # (T, 3), the box's last
-    n_box: int  # how many of them are the box's
+    n_box: int  # number of the box's triangles
     low: NDArray[np.float64]  # (3,) mm, the box's corner at index -0.5
     high: NDArray[np.float64]  # (3,) mm, at index shape - 0.5
-    notes: list[str]  # what was dropped
+    notes: list[str]  # dropped parts
 
 
 def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels: Image | None = None) -> Surfaces:
-    """All interfaces between the classes of an image, or between given labels, and the box around them.
+    """Extract all interfaces between the classes of an image, or between given labels, and the box around them.
 
     Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the thresholds of the
     classes, and each threshold's isosurface is an interface. They are level sets of one field, so they nest. With
-    labels: one conforming surface on which three and more labels may meet (surface nets). Either way small pieces
-    are dropped, then come smoothing by a windowed sinc and quadric decimation to triangles of about 0.7 `size`.
+    labels: one conforming surface on which three or more labels may meet (surface nets). Then small pieces are dropped,
+    and the surface is smoothed by a windowed sinc and decimated by quadrics to triangles of about 0.7 `size`.
 
     Parameters
     ----------
@@ -65,8 +65,8 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
     Raises
     ------
     InputError
-        An image that is not 3-D, labels of another shape or that are not whole numbers, a size that is not above 0,
-        or classes that the intensities do not have (see `tetopt.contents.otsu.class_thresholds`).
+        The image is not 3-D; labels have another shape or are not whole numbers; the size is not above 0; the
+        intensities do not have so many classes (see `tetopt.contents.otsu.class_thresholds`).
     """
     _check(image, size, labels)
     if labels is None:
@@ -77,13 +77,13 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
     cut = [_cut_by_box(_decimated(piece, size), low, high) for piece in pieces]
     soup = [(points, triangles) for points, triangles in cut if len(triangles)]
     if not soup:
-        notes.append("no interface is left: only the box is meshed")
+        notes.append("no interface remains: only the box is meshed")
     points, triangles = _stacked([*soup, _box(low, high)])
     return Surfaces(points, triangles, 12, low, high, notes)
 
 
 def class_labels(image: Image, classes: int) -> Image:
-    """Label image, 0 to classes - 1: the classes whose interfaces `interfaces` extracts, voxel by voxel.
+    """Return the classes of `interfaces`, voxel by voxel, as a label image of 0 to classes - 1.
 
     Raises
     ------
@@ -95,14 +95,14 @@ def class_labels(image: Image, classes: int) -> Image:
 
 
 def _classes(image: Image, classes: int) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
-    """The smoothed volume and the thresholds between its classes."""
+    """Return the smoothed volume and the thresholds between its classes."""
     smooth = gaussian_filter(image.data, SIGMA_VOXELS, mode="nearest")
     return smooth, class_thresholds(smooth.ravel(), classes)
 
 
 def _check(image: Image, size: float, labels: Image | None) -> None:
     if image.ndim != 3:
-        raise InputError(f"image: surfaces need 3 axes, got shape {image.shape}; pick a volume")
+        raise InputError(f"image: surfaces need 3 axes, got shape {image.shape}; select a volume")
     if not (np.isfinite(size) and size > 0.0):
         raise InputError(f"size: expected a length above 0 mm, got {size}")
     if labels is None:
@@ -121,9 +121,9 @@ def _isosurfaces(image: Image, size: float, classes: int) -> tuple[list[pyvista.
         surface = grid.contour([threshold], method="flying_edges", compute_normals=False, compute_gradients=False)
         large, n_dropped = _without_specks(surface, size)
         if n_dropped:
-            notes.append(f"threshold {threshold:.4g}: {n_dropped} specks of surface dropped")
+            notes.append(f"threshold {threshold:.4g}: dropped {n_dropped} specks of surface")
         if large.n_cells == 0:
-            notes.append(f"threshold {threshold:.4g}: its surface vanishes, every piece is a speck")
+            notes.append(f"threshold {threshold:.4g}: dropped the whole surface, as every piece is a speck")
             continue
         pieces.append(_smoothed(large))
     return pieces, notes
@@ -135,22 +135,22 @@ def _label_surface(
     values, numbered = np.unique(data, return_inverse=True)
     if len(values) == 1:
         return [], []
-    # Numbers from 1: 0 would be the filter's background, at which it draws no internal boundary.
+    # Numbers from 1: 0 would be the filter's background, where it extracts no internal boundary.
     grid = _padded_grid((numbered.reshape(data.shape) + 1).astype(np.int16), spacing, size)
     surface = grid.contour_labels(
         "internal", background_value=0, pad_background=False, smoothing=True, output_mesh_type="triangles"
     )
     large, n_dropped = _without_specks(surface, size)
-    notes = [f"labels: {n_dropped} specks of surface dropped"] if n_dropped else []
+    notes = [f"labels: dropped {n_dropped} specks of surface"] if n_dropped else []
     seen = np.unique(large.cell_data["boundary_labels"]) if large.n_cells else np.array([], dtype=int)
     lost = [f"{value:g}" for number, value in enumerate(values, 1) if number not in seen]
     if lost and n_dropped:
-        notes.append(f"labels that vanish, every piece of their surface is a speck: {', '.join(lost)}")
+        notes.append(f"lost labels, as every piece of their surface is a speck: {', '.join(lost)}")
     return ([_smoothed(large)] if large.n_cells else []), notes
 
 
 def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
-    """The volume on its voxel centres, continued by its border values past the box's faces."""
+    """Return the volume on its voxel centres, continued by its border values beyond the box's faces."""
     pad = np.maximum(PAD_VOXELS, np.ceil(size / spacing)).astype(int)
     padded = np.pad(volume, [(p, p) for p in pad], mode="edge")
     grid = pyvista.ImageData(dimensions=padded.shape, spacing=spacing, origin=-pad * spacing)
@@ -159,7 +159,7 @@ def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> 
 
 
 def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.PolyData, int]:
-    """The pieces of at least `SPECK_AREA` size^2, and how many were dropped."""
+    """Return the pieces of at least `SPECK_AREA` size^2, and the number of dropped ones."""
     if surface.n_cells == 0:
         return surface, 0
     triangles = surface.regular_faces
@@ -191,7 +191,7 @@ def _decimated(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
 def _cut_by_box(
     surface: pyvista.PolyData, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The part of a surface inside the box; its rim lies exactly on the box's faces."""
+    """Return the part of a surface inside the box; its rim lies exactly on the box's faces."""
     surface = pyvista.PolyData.from_regular_faces(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
     for axis in range(3):
         for place, sign in ((low, 1.0), (high, -1.0)):
@@ -210,7 +210,7 @@ def _cut_by_box(
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     box = pyvista.Box(np.stack([low, high], axis=1).ravel(), quads=False)
     corners, triangles = np.unique(np.asarray(box.points, dtype=np.float64), axis=0, return_inverse=True)
-    # pyvista's points are single precision: each coordinate is put back to the nearer of the two faces.
+    # pyvista's points are single precision: each coordinate is moved to the nearer of the two faces.
     corners = np.where(corners < 0.5 * (low + high), low, high)
     return corners, triangles.reshape(-1)[box.regular_faces].astype(np.int64)
 
@@ -224,6 +224,6 @@ def _stacked(
 
 
 def compacted(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
-    """Without the points that no cell (or triangle) uses; those that are left keep their order."""
+    """Remove the points that no cell (or triangle) uses; the others keep their order."""
     used, compact = np.unique(cells, return_inverse=True)
     return points[used], compact.reshape(cells.shape).astype(np.int64)

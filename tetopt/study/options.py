@@ -1,4 +1,4 @@
-"""What can be asked of a comparison and of a conventional mesh, and the settings that come of it."""
+"""Options of a comparison and of a conventional mesh, and the resulting settings."""
 
 from __future__ import annotations
 
@@ -20,51 +20,51 @@ ClassesOption = Annotated[int, Option("K", "Classes of the segmentation (multi-O
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedOptions:
-    """What is compared."""
+    """The compared pipelines, and their inputs."""
 
-    panel: ClassVar[str] = "What is compared"
-    nodes: Annotated[int, Option("N", "Wanted number of nodes, of every mesh.", least=20)] = DEFAULT_SETTINGS.nodes
+    panel: ClassVar[str] = "Comparison"
+    nodes: Annotated[int, Option("N", "Target number of nodes of every mesh.", least=20)] = DEFAULT_SETTINGS.nodes
     labels: Annotated[Path | None, Option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
     label_names: LabelNamesOption = None
     repeats: Annotated[int, Option("R", "Runs of a mesher whose result varies.", least=1)] = DEFAULT_SETTINGS.repeats
-    pipelines: Annotated[str, Option("A,B,...", f"Of {', '.join(PIPELINES)}: which, in order.")] = ",".join(PIPELINES)
+    pipelines: Annotated[str, Option("A,B,...", f"In order, from {', '.join(PIPELINES)}.")] = ",".join(PIPELINES)
     programs: Annotated[
         list[str] | None,
         Option(
             "NAME=COMMAND",
-            "A program as one more pipeline: 'NAME=program {image} {labels} {nodes} {output}'.",
+            "Add a program as a pipeline: 'NAME=program {image} {labels} {nodes} {output}'.",
             "pipeline",
         ),
     ] = None
     k_D: Annotated[float, Option("K", "Weight of the image on uniform meshes.", "k-d")] = DEFAULT_SETTINGS.k_D
     classes: ClassesOption = DEFAULT_SETTINGS.classes
-    curve: Annotated[str, Option("F,...", "Node counts of the error curves, as parts of N; empty for none.")] = (
+    curve: Annotated[str, Option("F,...", "Node counts of the error curves, as fractions of N; empty for none.")] = (
         ",".join(f"{factor:g}" for factor in DEFAULT_SETTINGS.curve)
     )
-    tradeoff: Annotated[bool, Option(None, "Sweep tetopt's options around its defaults: some 20 more runs.")] = False
+    tradeoff: Annotated[bool, Option(None, "Sweep tetopt's options around its defaults: about 20 more runs.")] = False
     part: BoxPart = WHOLE_BOX
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions:
-    """The simulation that meshes are measured by."""
+    """The simulation on all meshes."""
 
-    panel: ClassVar[str] = "The simulation"
+    panel: ClassVar[str] = "Simulation"
     young: Annotated[
         str | None, Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
     ] = None
     average: Annotated[str, AVERAGE_OPTION] = DEFAULT_SETTINGS.average
     reference_seconds: Annotated[
-        float | None, Option("S", "Time for the voxel grid that is the truth; it is as fine as fits. Default: 120.")
+        float | None, Option("S", "Time for the reference on the voxel grid, made as fine as fits. Default: 120.")
     ] = None
-    reference_dofs: Annotated[int | None, Option("D", "Size of that grid exactly, instead of a time.", least=1000)] = (
+    reference_dofs: Annotated[int | None, Option("D", "Exact size of that grid, instead of a time.", least=1000)] = (
         DEFAULT_SETTINGS.reference_dofs
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitOptions:
-    """What one run of a pipeline may take."""
+    """Limits of one run of a pipeline."""
 
     panel: ClassVar[str] = "Limits"
     max_seconds: Annotated[float, Option("S", "Time limit of one run of a pipeline.")] = DEFAULT_SETTINGS.max_seconds
@@ -73,17 +73,17 @@ class LimitOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
-    """Everything that is asked of a comparison."""
+    """All options of a comparison."""
 
     def settings(self) -> Settings:
-        """What is compared and how; InputError for a number out of range."""
+        """Return the settings; raise InputError for a number out of range."""
         if not 0.0 <= self.k_D < 1.0:
             raise InputError(f"`k_D`: expected 0 <= k_D < 1, got {self.k_D}")
         _check_limit("max_seconds", self.max_seconds)
         _check_limit("max_gb", self.max_gb)
         parse_average(self.average)
         if self.reference_seconds is not None and self.reference_dofs is not None:
-            raise InputError("`reference_seconds`: `reference_dofs` sets the size of the reference already; give one")
+            raise InputError("`reference_seconds`: `reference_dofs` already sets the size of the reference; give one")
         _check_limit("reference_seconds", self.reference_seconds)
         programs = _programs(self.programs or [])
         names = [name.strip() for name in self.pipelines.split(",")]
@@ -99,12 +99,12 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineOptions:
-    """What is asked of a conventional mesh."""
+    """Options of a conventional mesh."""
 
     pipeline: Annotated[Literal["pytetwild", "cleaver"], Option(None, "The mesher of the conventional pipeline.")] = (
         "pytetwild"
     )
-    nodes: Annotated[int, Option("N", "Wanted number of nodes.", least=20)] = DEFAULT_NODES[3]
+    nodes: Annotated[int, Option("N", "Target number of nodes.", least=20)] = DEFAULT_NODES[3]
     labels: Annotated[Path | None, Option("LABELS", "Label image instead of a segmentation of IMAGE.")] = None
     classes: ClassesOption = DEFAULT_SETTINGS.classes
     part: BoxPart = WHOLE_BOX
@@ -116,11 +116,11 @@ def _check_limit(name: str, limit: float | None) -> None:
 
 
 def _programs(texts: list[str]) -> tuple[Program, ...]:
-    """The user's own pipelines; InputError for one that cannot be run, or a name that there is already."""
+    """Parse the user's own pipelines; raise InputError for one that cannot be run, or a duplicate name."""
     programs = tuple(map(parse_program, texts))
     names = [*PIPELINES, *(each.name for each in programs)]
     if twice := [name for number, name in enumerate(names) if name in names[:number]]:
-        raise InputError(f'`pipeline`: there is a pipeline named "{twice[0]}" already; give it another name')
+        raise InputError(f'`pipeline`: expected unique names, got "{twice[0]}" again; use another name')
     return programs
 
 
@@ -130,5 +130,5 @@ def _parse_curve(text: str) -> tuple[float, ...]:
     except ValueError:
         factors = (0.0,)
     if any(not 0.0 < factor < 100.0 for factor in factors):
-        raise InputError(f'`curve`: expected parts of the node count, such as "0.25,0.5,2", got "{text}"')
+        raise InputError(f'`curve`: expected fractions of the node count, such as "0.25,0.5,2", got "{text}"')
     return factors

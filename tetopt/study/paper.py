@@ -1,7 +1,7 @@
-"""The paper's figures and its table, run again: each function is one figure and returns its meshes or numbers.
+"""Reproduction of the paper's figures and table: each function is one figure and returns its meshes or numbers.
 
-Numbers that the paper prints are in `paper.toml`. Where the paper does not say how a figure was made, the choice is
-stated in the function's docstring; nothing is chosen to make a number match.
+Numbers that the paper prints are in `paper.toml`. Choices that the paper does not state are in the functions'
+docstrings; none was made to match a number.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from tetopt.start.lattice import lattice_mesh
 
 
 def printed() -> dict[str, Any]:
-    """The numbers that the paper prints, and what is said of each experiment, from `paper.toml`."""
+    """Return the paper's printed numbers, and the text on each experiment, from `paper.toml`."""
     return tomllib.loads((files("tetopt.study") / "paper.toml").read_text(encoding="utf-8"))
 
 
@@ -54,11 +54,11 @@ def errors_of(mesh: Mesh) -> QualityErrors:
 
 
 def geometric_mean_error(mesh: Mesh) -> float:
-    """The geometric mean of 1/n - rho, which is what column (ii) of Table 1 seems to hold.
+    """Geometric mean of 1/n - rho, which column (ii) of Table 1 seems to contain.
 
-    The paper's text has a harmonic mean there. But its row 6 is of a mesh with two kinds of triangles, half of each:
-    its (i), (iii) and (iv) leave errors 0.0922 and 0.0795, of which the harmonic mean is 0.0854 and the geometric mean
-    0.0856. Printed is 0.0856; and in the other rows the geometric mean of our meshes is far nearer, too.
+    The paper's text states a harmonic mean. But its row 6 is a mesh of two kinds of triangles, half of each: (i), (iii)
+    and (iv) imply errors of 0.0922 and 0.0795, whose harmonic mean is 0.0854 and geometric mean 0.0856. The paper
+    prints 0.0856; in the other rows the geometric mean of our meshes is also much closer.
     """
     error = np.maximum(1.0 / mesh.ndim - rho(mesh.points, mesh.cells), np.finfo(float).tiny)
     return float(np.exp(np.log(error).mean()))
@@ -70,9 +70,9 @@ def geometric_mean_error(mesh: Mesh) -> float:
 def figure_1(seed: int) -> Case:
     """61 random nodes in a uniform square, Lloyd's alternation until the nodes stop (Fig. 1, Table 1 rows 1, 2).
 
-    The paper does not say how the nodes were drawn. Here 24 lie evenly on the square's boundary and are fixed, 37 are
-    uniform inside: so boundary and inside have about the same distance between nodes. With fewer on the boundary E_G
-    gains by pulling inner nodes onto it, which leaves flat cells there.
+    The paper does not say how the nodes were drawn. Here 24 lie evenly on the square's boundary and are fixed, and 37
+    are uniform inside, so that nodes are about equally far apart on the boundary and inside. With fewer on the
+    boundary, E_G decreases by pulling inner nodes onto it, which leaves flat cells there.
     """
     image = Image(np.full((100, 100), 1.0))
     side = np.linspace(-0.5, 99.5, 7)
@@ -88,7 +88,7 @@ def figure_1(seed: int) -> Case:
 
 
 def figure_1_spread(seeds: int) -> dict[str, NDArray[np.float64]]:
-    """The four errors and the geometric mean, before and after, for seeds 0 .. seeds - 1, (seeds, 5) each."""
+    """Return the four errors and the geometric mean, before and after, for seeds 0 .. seeds - 1, (seeds, 5) each."""
     before, after = [], []
     for seed in range(seeds):
         case = figure_1(seed)
@@ -124,7 +124,7 @@ class Landscape(NamedTuple):
 
 @cache
 def _energies_2b(n_places: int) -> tuple[Image, Mesh, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Image, mesh, coordinates of the places along an axis, and both energies there, (n, n): the same for any k_D."""
+    """Return image, mesh, places along an axis, and both energies there, (n, n), which do not depend on k_D."""
     size = 60
     index = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1)
     image = Image(np.where(index @ [1.0, 0.45] > 58.0, 200.0, 60.0))
@@ -142,9 +142,9 @@ def _energies_2b(n_places: int) -> tuple[Image, Mesh, NDArray[np.float64], NDArr
 
 
 def figure_2b(k_D: float, n_places: int = 41) -> Landscape:
-    """The combined energy as a function of the centre node's position, and the minimum that the descent finds.
+    """Compute the combined energy by the centre node's position, and the minimum that the descent finds.
 
-    The image, "simple" in the paper, is a square whose corner is bright along a slanted line.
+    The image, "simple" in the paper, is a square with a corner that is bright beyond a slanted line.
     """
     image, mesh, places, E_G_there, E_D_there = _energies_2b(n_places)
     initial = E_G(mesh.points, mesh.cells), E_D(image, mesh)
@@ -170,7 +170,7 @@ def figure_3ab(volume: Image) -> Case:
 
 
 def _cropped_to_content(image: Image, proportions: tuple[int, ...]) -> Image:
-    """The box of voxels above the image's mean, widened to about these proportions where the image allows."""
+    """Crop to the voxels above the image's mean, widened to about these proportions where the image allows."""
     inside = np.argwhere(image.data > image.data.mean())
     low, high = inside.min(axis=0).astype(float) - 1.0, inside.max(axis=0) + 2.0
     size = (high - low) * image.spacing
@@ -183,19 +183,19 @@ def _cropped_to_content(image: Image, proportions: tuple[int, ...]) -> Image:
 def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
     """1 / strain, an approximation of the elastic modulus from a strain map (Section 3), float64.
 
-    It is the modulus in units of the stress, if that were the same everywhere: in kPa under a stress of 1 kPa.
+    For a uniform stress this is the modulus in units of the stress: in kPa under a stress of 1 kPa.
 
     Parameters
     ----------
     strain : array of real numbers
-        Compression and extension alike: the absolute value counts.
+        Compression or extension; only the absolute value is used.
     floor : float
-        Strains smaller than this, noise among them, count as this one, so the modulus is at most 1 / floor.
+        Smaller strains, including noise, are raised to this value, so the modulus is at most 1 / floor.
 
     Raises
     ------
     InputError
-        A strain that is not finite, or a floor that is not above 0.
+        A strain is not finite, or `floor` is not above 0.
 
     Examples
     --------
@@ -207,7 +207,7 @@ def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
         raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
     if not np.isfinite(strain).all():
         raise InputError(
-            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them, 0 stands for stiff"
+            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them (0 stands for stiff)"
         )
     return 1.0 / np.maximum(np.abs(strain), floor)
 
@@ -217,7 +217,7 @@ def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
 
     `prostate_2d` is compressed by 1 %, plane stress, on a mesh of four triangles to every 0.5 mm pixel. The axial
     strain of each pixel gets Gaussian noise of the given signal-to-noise ratio (20 log10 of mean over sd; None for
-    no noise), and is kept above a fifth of its median before it is inverted, as a strain imager would clip it.
+    no noise), and is clipped to at least a fifth of its median before it is inverted, as by a strain imager.
     """
     stiffness = load_phantom("prostate_2d").image()
     fine = lattice_mesh(stiffness, blocks=stiffness.shape)
@@ -247,8 +247,8 @@ def figure_3cd(snr_db: float | None) -> Case:
 def figure_3ef(volume: Image) -> Case:
     """A brain MR volume on 1078 nodes, 13 x 10 x 6 cubes of five tetrahedra, optimised (Fig. 3(e, f)).
 
-    The paper gives neither the cubes' size nor the iterations. Ours: cubes of 10 mm around the middle of the head, 13
-    from front to back, 10 across, 6 up; k_D = 0.3, 15 iterations, nodes sliding in the box's faces.
+    The paper states neither the cubes' size nor the iterations. Here cubes of 10 mm are around the middle of the head,
+    13 from front to back, 10 across, 6 up; k_D = 0.3, 15 iterations, nodes sliding in the box's faces.
     """
     order = np.argsort([np.argmax(np.abs(volume.affine[:3, axis])) for axis in range(3)])  # axes by world x, y, z
     blocks = np.empty(3, dtype=int)
@@ -267,7 +267,7 @@ def figure_3ef(volume: Image) -> Case:
 
 
 def segmentation_case(volume: Image) -> Case:
-    """The whole volume on about 5000 nodes, a cell to some 300 voxels; k_D = 0.3, 10 iterations."""
+    """Mesh the whole volume with about 5000 nodes, a cell for about 300 voxels; k_D = 0.3, 10 iterations."""
     mesh = lattice_mesh(volume, nodes=5000)
     return Case("brain MR volume", volume, mesh, optimize_paper(volume, mesh, k_D=0.3, iterations=10))
 
@@ -276,7 +276,7 @@ def segmentation_case(volume: Image) -> Case:
 
 
 class Simulated(NamedTuple):
-    """What the compression test finds on a mesh; each with one modulus a cell."""
+    """Results of the compression test on a mesh, with one modulus per cell."""
 
     lambda_max: float
     cond: float
@@ -295,15 +295,13 @@ def simulate(
 ) -> tuple[Simulated, Compression]:
     """Top fixed, bottom pushed in by `percent` of the height along the faces' normal, both bonded.
 
-    `mapping` takes intensities to kPa (see `tetopt.model.mappings.young_from`); None: the image is the modulus.
-    `average` makes one of those of a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq.
-    (2).
+    `mapping` converts intensities to kPa (see `tetopt.model.mappings.young_from`); None: the image is the modulus.
+    `average` averages a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq. (2).
 
     Raises
     ------
     InputError
-        An average that there is not, a modulus that is not positive, or a mesh that does not fill the image's box in
-        one piece.
+        The average is unknown, a modulus is not positive, or the mesh does not fill the image's box in one piece.
     """
     bottom, top = box_faces(image, mesh)
     check_fills_box(image, mesh)

@@ -1,4 +1,4 @@
-"""Pictures of the paper's experiments, run again by `tetopt.study.paper`, that no other command draws."""
+"""Pictures of the paper's experiments, reproduced by `tetopt.study.paper`, that no other command draws."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BEFORE_COLOUR, AFTER_COLOUR = "#7f7f7f", "#d95f02"
 
 
 def relaxation_figure(case: Case) -> Figure:
-    """Fig. 1: the mesh before (a) and after (b), E_G and movement by iteration (c), rho histograms (d)."""
+    """Plot Fig. 1: the mesh before (a) and after (b), E_G and movement by iteration (c), rho histograms (d)."""
     initial, final, history = case.initial, case.result.mesh, case.result.history
     figure = Figure(figsize=(13.5, 3.7), layout="constrained")
     panels = figure.subplots(1, 4)
@@ -26,7 +26,7 @@ def relaxation_figure(case: Case) -> Figure:
         axes.set_axis_off()
         axes.set_title(title, fontsize=10)
     iterations = [row.iteration for row in history]
-    panels[2].plot(iterations, [row.E_G / history[0].E_G for row in history], color="black", label="E_G, of initial")
+    panels[2].plot(iterations, [row.E_G / history[0].E_G for row in history], color="black", label="E_G, relative")
     panels[2].set_ylim(bottom=0.0)
     panels[2].set_xlabel("iteration")
     movement = panels[2].twinx()
@@ -43,7 +43,7 @@ def relaxation_figure(case: Case) -> Figure:
 
 
 def landscape_figure(landscapes: Sequence[Landscape]) -> Figure:
-    """Fig. 2(b): E over the centre node's place for several k_D, the minimum that the descent finds marked."""
+    """Plot Fig. 2(b): E over the centre node's place for several k_D, with the minimum that the descent finds."""
     image, columns = landscapes[0].image, len(landscapes) + 1
     figure = Figure(figsize=(4.2 * columns, 3.9), layout="constrained")
     axes = figure.add_subplot(1, columns, 1)

@@ -1,4 +1,4 @@
-"""All of the paper's experiments in one go: `paper.json`, a picture a figure, and `paper.html` made from them."""
+"""All of the paper's experiments in one run: `paper.json`, a picture per figure, and `paper.html`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tetopt.system.files import results_folder, save_json
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)
 SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d); None: without noise
-CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.json
+CHANGE_WORDS = {  # of quantities compared before and after, by name in paper.json
     "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",
 }  # fmt: skip
@@ -49,13 +49,13 @@ CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.j
 def reproduce(
     output: Path, image_path: Path | None, labels_path: Path | None, seeds: int, force: bool = False
 ) -> tuple[Path, float]:
-    """Run every experiment, write the files `PAPER_FILES` into a folder; the page, and the seconds that it took.
+    """Run every experiment, and write the files `PAPER_FILES` into a folder; return the page and the seconds taken.
 
     Parameters
     ----------
     output : Path
     image_path : Path or None
-        A brain MR volume, CSF dark, for Fig. 3(a, b, e, f) and the segmentation; None: nilearn's MNI152.
+        A brain MR volume with dark CSF, for Fig. 3(a, b, e, f) and the segmentation; None: nilearn's MNI152.
     labels_path : Path or None
         Its tissue labels, on the same voxels; None: those of the MNI152, or no section on segmentation.
     seeds : int
@@ -66,7 +66,7 @@ def reproduce(
     Raises
     ------
     InputError
-        Files that cannot be read or written, or a volume too small or too plain for the figures.
+        Files cannot be read or written, or the volume is too small or uniform for the figures.
     """
     if seeds < 1:
         raise InputError(f"`seeds`: expected 1 or more, got {seeds}")
@@ -78,7 +78,7 @@ def reproduce(
     if min(volume.shape) < 16 or volume.range[0] == volume.range[1]:
         raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
     if tissue is None:
-        note("no `labels`: the section on approximate segmentation is left out")
+        note("the section on approximate segmentation is left out, as there are no `labels`")
     else:
         check_labels("labels", tissue)
     paths = checked_outputs(results_folder(output), PAPER_FILES, force)
@@ -103,13 +103,13 @@ def reproduce(
 
 
 def _section(name: str, **values: float) -> dict[str, Any]:
-    """Title and text of an experiment, with these numbers in it."""
+    """Return title and text of an experiment, with these numbers."""
     said = paper.printed()["sections"][name]
     return {"title": said["title"], "text": said["text"].format(**values)}
 
 
 def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
-    """A row of Table 1: what is printed, what came out."""
+    """Return a row of Table 1: printed and reproduced numbers."""
     return {"name": name, **paper.printed()["table1"][name], "ours": list(ours), "geometric_mean": geometric_mean}
 
 

@@ -1,4 +1,4 @@
-"""Seven ways from an image to a mesh of its box with a requested number of nodes, under one signature."""
+"""Seven pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
 
 from __future__ import annotations
 
@@ -24,46 +24,46 @@ from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 
-LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; there are few so coarse, and it takes milliseconds
+LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
 
 
 class PipelineInput(NamedTuple):
-    """What every pipeline gets."""
+    """Input of every pipeline."""
 
     image: Image  # 3-D
-    labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
+    labels: Image | None  # a given segmentation, on the image's voxels; without it, pipelines segment themselves
     nodes: int  # requested, in all
     classes: int = OTSU_CLASSES
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
-    iterations: int = UNIFORM_ITERATIONS  # likewise
-    order: int = 1  # of the cells whose nodes are counted: 2 also have one in the middle of each edge
+    iterations: int = UNIFORM_ITERATIONS  # of uniform meshes
+    order: int = 1  # of the cells whose nodes are counted: order 2 has mid-edge nodes
 
 
 class Produced(NamedTuple):
-    """What every pipeline returns."""
+    """Result of every pipeline."""
 
     mesh: Mesh  # fills the image's box, unless a note says otherwise
     seconds: dict[str, float]  # by step, in their order
     notes: list[str]
-    labels: NDArray[np.int64] | None = None  # (M,) of each cell, of the job's; of most of its voxels where -1, or None
+    labels: NDArray[np.int64] | None = None  # (M,) of each cell, from the job's; -1, or None: those of most voxels
 
 
-UNTIMED_STEPS = {  # steps that a run's total does not count, and why
+UNTIMED_STEPS = {  # steps that a run's total leaves out, and why
     "kernels": "loading compiled code, not in the total",
-    "search": "other runs, made to meet the number of nodes; not in the total",
+    "search": "other runs, to reach the number of nodes; not in the total",
 }
 
 
 @contextmanager
 def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
-    """Put the wall time of a block into `seconds`."""
+    """Store the wall time of a block in `seconds`."""
     begin = time.perf_counter()
     yield
     seconds[step] = time.perf_counter() - begin
 
 
 def bcc(job: PipelineInput) -> Produced:
-    """The body-centred cubic lattice, untouched.
+    """Build the body-centred cubic lattice, without optimisation.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def bcc(job: PipelineInput) -> Produced:
 
 
 def ours(job: PipelineInput, mode: Mode) -> Produced:
-    """`tetopt.mesh_image`: graded with its defaults, else as the job says; the paper's scheme takes the image alone.
+    """Run `tetopt.mesh_image`: graded with its defaults, else by the job; the paper's scheme uses only the image.
 
     Raises
     ------
@@ -97,13 +97,13 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
     result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations, order=job.order)
     seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
     seconds["optimize"] = result.seconds_run
-    # The reference knows straight edges alone, as the other pipelines' meshes have.
+    # The reference supports only straight edges, which the other pipelines' meshes have.
     mesh = Mesh(result.mesh.points, result.mesh.cells)
     return Produced(mesh, seconds, [f"ended by: {result.ended}", *notes], result.labels)
 
 
 def image_blind(job: PipelineInput) -> Produced:
-    """The paper's scheme with k_D = 0: optimal Delaunay triangulation, whatever the image is.
+    """Run the paper's scheme with k_D = 0: optimal Delaunay triangulation, independent of the image.
 
     Raises
     ------
@@ -114,18 +114,18 @@ def image_blind(job: PipelineInput) -> Produced:
 
 
 def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
-    """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
+    """Return the content of the mesh, and notes on it: the image, with labels if given."""
     if job.labels is None:
         return job.image, []
     with _timed(seconds, "labels"):
         if np.array_equal(job.image.data, job.labels.data):
-            # As intensities the numbers of labels mean nothing: label 9 is no farther from 1 than 2 is.
+            # Label numbers are meaningless as intensities: label 9 is no farther from 1 than label 2.
             return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
-        return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
+        return content(job.image, labels=job.labels), ["meshed from the image and the given labels, equally weighted"]
 
 
 def pytetwild(job: PipelineInput) -> Produced:
-    """Interfaces of the classes or labels, and fTetWild with a sizing field around them; see `tetwild`.
+    """Extract interfaces of classes or labels, and run fTetWild with a sizing field around them; see `tetwild`.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def pytetwild(job: PipelineInput) -> Produced:
 
 
 def cleaver(job: PipelineInput) -> Produced:
-    """Labels, given or by thresholds, and Cleaver's lattice stuffing; see `cleaver`.
+    """Run Cleaver's lattice stuffing on labels, given or by thresholds; see `cleaver`.
 
     Raises
     ------
@@ -158,14 +158,14 @@ def cleaver(job: PipelineInput) -> Produced:
 
 
 def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
-    """What a peer made; the runs that only met the number of nodes are a step of their own."""
+    """Return a peer's result, with the search for the number of nodes as a separate step."""
     seconds["tetrahedra"] -= result.search_seconds
     seconds["search"] = result.search_seconds
     return Produced(result.mesh, seconds, [*notes, f"{result.n_runs} runs", *result.notes])
 
 
 class Pipeline(NamedTuple):
-    """How a pipeline is shown, what it does, and whether its result changes from run to run."""
+    """A pipeline: its title and description, its function, and whether its result varies between runs."""
 
     title: str
     kind: str  # "tetopt", "peer" or "control"
@@ -176,23 +176,23 @@ class Pipeline(NamedTuple):
 
 PIPELINES = {
     "tetopt": Pipeline(
-        "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or labels given, have content",
+        "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or given labels, have detail",
         partial(ours, mode="graded"),
     ),
     "tetopt-uniform": Pipeline(
-        "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with labels that are given",
+        "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with given labels",
         partial(ours, mode="uniform"),
     ),
     "tetopt-paper": Pipeline(
-        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, of the image alone",
+        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, from the image alone",
         partial(ours, mode="paper"),
     ),
     "pytetwild": Pipeline(
-        "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them",
+        "pytetwild", "peer", "classes by multi-Otsu or given labels, their surfaces, fTetWild sized by them",
         pytetwild, is_random=True,
     ),
     "cleaver": Pipeline("itk-cleaver", "peer", "the same labels, Cleaver", cleaver),
-    "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, untouched", bcc),
+    "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
     "odt": Pipeline(
         "ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0",
         image_blind,

@@ -1,7 +1,7 @@
-"""A mesher of the user's own in the comparison: a program that reads NIfTI files and writes a mesh.
+"""The user's own mesher in the comparison: a program that reads NIfTI files and writes a mesh.
 
-Its command line is split into arguments as a shell would, and the placeholders of each are filled; no shell runs it.
-It runs in the folder in which `tetopt` was started; image, labels and mesh lie in a temporary one.
+Its command line is split into arguments as by a shell, and their placeholders are replaced; no shell is involved. It
+runs in the current folder of `tetopt`; image, labels and mesh are in a temporary folder.
 """
 
 from __future__ import annotations
@@ -38,33 +38,33 @@ from tetopt.study.tetwild import node_spacing, put_on_box
 from tetopt.system.child import signal_words
 from tetopt.system.interpreter import others_environment
 
-PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
-NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them
+PROGRAM_RUNS = 5  # of one search, at most; the first requests the target, and the second is usually close
+NEAR_BOX_VOXELS = 1.0  # distance from the box's sides below which a mesh's boundary is moved onto them
 ROUGH_SIDE_VOXELS = 1e-3  # a node this near to a side is on it: CGAL finds the points of a surface to 1e-4 voxel
 PLACEHOLDERS = ("image", "labels", "nodes", "size", "output")
 PROGRAM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
 
 class Program(NamedTuple):
-    """A program, and what it is called in the comparison."""
+    """A program, and its name in the comparison."""
 
     name: str
-    command: str  # as it is written, with placeholders
+    command: str  # as given, with placeholders
 
 
 def parse_program(text: str) -> Program:
-    """The program of a text such as "cgal=cgal_mesh {labels} --size {size} -o {output}", checked.
+    """Parse and check a program such as "cgal=cgal_mesh {labels} --size {size} -o {output}".
 
-    Placeholders: ``{image}`` and ``{labels}``, paths of NIfTI files (without labels those of multi-Otsu classes);
-    ``{nodes}``, the number of nodes to ask for; ``{size}``, the edge length, mm, at which regular tetrahedra fill the
+    Placeholders: ``{image}`` and ``{labels}``, paths of NIfTI files (without labels, of multi-Otsu classes);
+    ``{nodes}``, the requested number of nodes; ``{size}``, the edge length, mm, at which regular tetrahedra fill the
     box with that many; ``{output}``, the path of the mesh to write, which ends in .vtu unless a suffix follows, as in
     ``{output}.msh``.
 
     Raises
     ------
     InputError
-        No name, or one that is no plain word; a command that cannot be split, has an unknown placeholder, lacks
-        ``{output}`` or both of ``{image}`` and ``{labels}``; a program that does not exist, or cannot be run.
+        The name is missing or not a plain word; the command cannot be split, has an unknown placeholder, lacks
+        ``{output}``, or has neither ``{image}`` nor ``{labels}``; the program does not exist, or cannot be run.
     """
     name, equals, command = text.partition("=")
     if not equals or not PROGRAM_NAME.fullmatch(name):
@@ -76,7 +76,7 @@ def parse_program(text: str) -> Program:
     try:
         words = shlex.split(command)
     except ValueError as error:
-        raise InputError(f"{where}: its quotes do not match ({error}): {command}") from error
+        raise InputError(f"{where}: unbalanced quotes ({error}): {command}") from error
     used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
     if unknown := sorted(used - set(PLACEHOLDERS)):
         raise InputError(f"{where}: expected placeholders of {_braced(PLACEHOLDERS)}, got {{{unknown[0]}}}")
@@ -87,7 +87,7 @@ def parse_program(text: str) -> Program:
         if suffix is not None and suffix not in MESH_SUFFIXES:
             raise InputError(f"{where}: the mesh must be named {', '.join(MESH_SUFFIXES)}, got {{output}}{suffix}")
     if shutil.which(words[0]) is None:
-        raise InputError(f'{where}: no program "{words[0]}" that can be run; give its path, or put its folder on PATH')
+        raise InputError(f'{where}: found no executable program "{words[0]}"; give its path, or add its folder to PATH')
     return Program(name, command)
 
 
@@ -96,21 +96,21 @@ def _braced(names: tuple[str, ...]) -> str:
 
 
 def _suffix(word: str) -> str | None:
-    """What the mesh's name ends in, if the word has the mesh's name."""
+    """Return the suffix of the mesh's name, if the word contains it."""
     match = re.search(r"\{output\}(\.\w+)?", word)
     return None if match is None else match[1] or ".vtu"
 
 
 def by_program(job: PipelineInput, program: Program) -> Produced:
-    """The program's mesh of about as many nodes as the job says, its boundary on the box if it lies near.
+    """Return the program's mesh with about the job's number of nodes, its boundary on the box if it lies close.
 
-    What it is told to make is corrected up to four times until the number of nodes is within 5 %.
+    The request is corrected up to four times until the number of nodes is within 5 %.
 
     Raises
     ------
     InputError
-        The program ends with another code than 0, or without a mesh that can be read: the last line that it wrote on
-        its standard error.
+        The program's exit code is not 0, or it wrote no readable mesh; the message has the last line of its standard
+        error.
     """
     words = shlex.split(program.command)
     suffix = next(suffix for word in words if (suffix := _suffix(word)) is not None)
@@ -128,7 +128,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
             except InputError as error:
                 if not sizes:
                     raise
-                notes.append(f"asked for {request} nodes: {error}")
+                notes.append(f"request for {request} nodes: {error}")
                 return None
             sizes.append(node_count(loaded.mesh.points, loaded.mesh.cells, job.order))
             return loaded
@@ -139,7 +139,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
     loaded = runs[0].result
     if not is_near(runs[0].n_nodes, job.nodes):
         counts = ", ".join(map(str, sizes))
-        notes.append(f"{runs[0].n_nodes} nodes, {job.nodes} were asked for; its runs gave {counts}")
+        notes.append(f"{runs[0].n_nodes} nodes, {job.nodes} were requested; the runs gave {counts}")
     mesh, kept, on_box = boxed(job.image, loaded.mesh)
     labels, of_labels = _own_labels(loaded, kept, job)
     seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}
@@ -147,7 +147,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
 
 
 def _inputs(folder: Path, job: PipelineInput, command: str) -> dict[str, str]:
-    """Paths by placeholder; of the files that the program reads those are written that it is to read."""
+    """Return paths by placeholder, and write the input files that the command names."""
     paths = {"image": str(folder / "image.nii.gz"), "labels": str(folder / "labels.nii.gz")}
     if "{image}" in command:
         save_image(paths["image"], job.image)
@@ -157,7 +157,7 @@ def _inputs(folder: Path, job: PipelineInput, command: str) -> dict[str, str]:
 
 
 def _filled(word: str, values: dict[str, str]) -> str:
-    """An argument with its placeholders filled; the mesh is a VTU file unless a suffix follows its placeholder."""
+    """Replace the placeholders in an argument; the mesh is a VTU file unless a suffix follows its placeholder."""
     word = re.sub(r"\{output\}(?!\.\w)", "{output}.vtu", word)
     return re.sub(r"\{(\w+)\}", lambda match: values[match[1]], word)
 
@@ -165,20 +165,20 @@ def _filled(word: str, values: dict[str, str]) -> str:
 def _own_labels(
     loaded: MeshFile, kept: NDArray[np.int64], job: PipelineInput
 ) -> tuple[NDArray[np.int64] | None, list[str]]:
-    """The label that a program gives each cell kept, as "label" in its file, -1 if it is none of the image's.
+    """Return a program's labels of the kept cells, "label" in its file, -1 for labels that the image does not have.
 
-    A label that all cells have is the number of a file's only part.
+    A label that all cells share is the number of a file's only part.
     """
     labels = loaded.cell_data.get("label")
     if labels is None or job.labels is None or labels.ndim != 1 or len(np.unique(labels)) == 1:
         return None, []
     is_known = np.isin(labels[kept], np.unique(job.labels.data))
-    note = f'{is_known.sum()} of {len(kept)} cells count for the "label" that its file gives them'
+    note = f'{is_known.sum()} of {len(kept)} cells use the "label" in their file'
     return np.where(is_known, labels[kept], -1).astype(np.int64), [note]
 
 
 def _run(name: str, command: list[str], output: Path) -> MeshFile:
-    """One run; its mesh, in three dimensions, its cells positively oriented."""
+    """Run the program once; return its 3-D mesh with positively oriented cells."""
     output.unlink(missing_ok=True)
     try:
         done = subprocess.run(
@@ -188,7 +188,7 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
     except OSError as error:
         raise InputError(f"{name}: cannot be run ({error})") from error
     line = last_line(done.stderr.decode(errors="replace"))
-    said = f": {line}" if line else ", and wrote nothing on its standard error"
+    said = f": {line}" if line else ", with nothing on its standard error"
     if (crash := signal_words(done.returncode)) is not None:
         raise Crashed(f"{name} crashed ({crash}){said}")
     if done.returncode != 0:
@@ -202,9 +202,9 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
 
 
 def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
-    """The mesh with its boundary on the sides of the image's box, if it lies near them, its cells, and notes on that.
+    """Move a mesh's boundary onto the sides of the image's box if close; return the mesh, its cells, and notes.
 
-    A mesh whose boundary lies farther off than `NEAR_BOX_VOXELS`, or which does not fill the box then, stays as it is.
+    A mesh whose boundary is farther away than `NEAR_BOX_VOXELS`, or which would not fill the box, is unchanged.
     """
     sides, every = box_sides(image.shape), np.arange(len(mesh.cells))
     index = image.to_index(mesh.points)
@@ -214,11 +214,11 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
     if distance <= ON_SIDE_VOXELS:
         return mesh, every, []
     if distance > NEAR_BOX_VOXELS:
-        return mesh, every, [f"its boundary lies up to {distance:.3g} voxels off the sides of the image's box"]
-    # Stretched onto the box first, which turns no cell inside out: a mesh of padded labels is too wide by half a voxel.
+        return mesh, every, [f"its boundary lies up to {distance:.3g} voxels from the sides of the image's box"]
+    # Stretched onto the box first, which inverts no cell: a mesh of padded labels is half a voxel too wide.
     low, high = index.min(axis=0), index.max(axis=0)
     index = sides[:, 0] + (index - low) * (sides[:, 1] - sides[:, 0]) / (high - low)
-    # Nodes meant to be on a side may lie under flat cells, which hide them from `put_on_box`.
+    # Nodes that belong on a side may lie under flat cells, where `put_on_box` does not find them.
     for side in (0, 1):
         index = np.where(np.abs(index - sides[:, side]) <= ROUGH_SIDE_VOXELS, sides[:, side], index)
     is_flat = np.any(np.all(is_on_sides(index, sides, 0.0)[mesh.cells], axis=1), axis=(1, 2))
@@ -232,14 +232,14 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
 
 
 def file_checksums(program: Program) -> list[str]:
-    """SHA-256 of the program, and of every file that its command line names, such as a script."""
+    """Return the SHA-256 of the program, and of every file in its command line, such as a script."""
     files = (shutil.which(word) or word for word in shlex.split(program.command))
-    # By os.path: to Path.is_file a word that is too long for a name, as a shell's whole script may be, is an error.
+    # With os.path, as Path.is_file fails for words too long for a name, such as a whole shell script.
     return [sha256(Path(name)) for name in files if os.path.isfile(name)]
 
 
 def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:
-    """All pipelines by name, the user's programs last."""
+    """Return all pipelines by name, the user's programs last."""
     return PIPELINES | {
         each.name: Pipeline(each.name, "peer", f"a program: {each.command}", partial(by_program, program=each))
         for each in programs

@@ -1,6 +1,6 @@
-"""The number of nodes that was asked for, from meshers that take none: run after run with another factor.
+"""Search for a requested number of nodes with meshers that do not accept one: repeated runs with other factors.
 
-Nodes are counted as the cells' order has them: quadratic cells also have one in the middle of each edge.
+Nodes are counted by the cells' order: quadratic cells also have mid-edge nodes.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from tetopt.engine.meshing import QUADRATIC_NODES
 
 Result = TypeVar("Result")
 
-NODE_TOLERANCE = 0.05  # of the requested number of nodes, within which a search for it ends
+NODE_TOLERANCE = 0.05  # of the requested number of nodes: the tolerance that ends a search
 
 
 class Response(NamedTuple):
-    """How the number of nodes answers to a mesher's factor: d log nodes / d log factor, and how far to go at once."""
+    """Response of the number of nodes to a mesher's factor: d log nodes / d log factor, and the step limits."""
 
-    guess: float  # before two runs have shown it
-    low: float  # limits to what two runs may show
+    guess: float  # before two runs measure it
+    low: float  # limits of the measured slope
     high: float
-    step: float  # by how much a factor may change from one run to the next, up or down
-    after_failure: float  # what it is multiplied by after a run without a mesh
+    step: float  # maximum change of the factor between runs, up or down
+    after_failure: float  # multiplier of the factor after a run without a mesh
 
 
-# Of nodes to the number that is asked for: proportional, or nearly so. What fails is rather too coarse than too fine.
+# Response to the requested number: about proportional. Failed runs are more often too coarse than too fine.
 REQUEST_RESPONSE = Response(1.0, 0.3, 3.0, step=4.0, after_failure=1.25)
-LEAST_REQUEST = 8  # nodes: a box has as many corners
+LEAST_REQUEST = 8  # nodes: the corners of a box
 
 
 class Try(NamedTuple, Generic[Result]):
@@ -51,20 +51,20 @@ def tries(
     first: float = 1.0,
     most: int,
 ) -> list[Try[Result]]:
-    """Run with one factor after the other until the number of nodes is within 5 % of `nodes`; the nearest run first.
+    """Run with successive factors until the number of nodes is within 5 % of `nodes`; return the closest run first.
 
     Parameters
     ----------
     run : callable
-        Takes a factor; None says that there is no mesh, and another try beside follows.
+        Takes a factor; returns None without a mesh, and a nearby factor is tried.
     count : callable
-        The nodes of what `run` returned.
+        Counts the nodes of a result of `run`.
     nodes : int
     response : Response
     first : float
         Factor of the first run.
     most : int
-        Runs at most, those without a mesh included.
+        Maximum number of runs, including those without a mesh.
     """
     done: list[Try[Result]] = []
     factor = first
@@ -82,24 +82,24 @@ def tries(
 
 
 def corners_for(nodes: int, order: int) -> int:
-    """About how many corners a mesh has whose cells of this order have `nodes` nodes in all."""
+    """Estimate the number of corners of a mesh whose cells of this order have `nodes` nodes in total."""
     return max(nodes if order == 1 else round(nodes / QUADRATIC_NODES[3]), LEAST_REQUEST)
 
 
 def is_near(count: int, nodes: int) -> bool:
-    """Whether a number of nodes is the requested one, within `NODE_TOLERANCE`."""
+    """Return whether a number of nodes is the requested one, within `NODE_TOLERANCE`."""
     return abs(count / nodes - 1.0) <= NODE_TOLERANCE
 
 
 def next_factor(tried: list[tuple[float, int]], nodes: int, response: Response) -> float:
-    """The factor at which the secant of log nodes over log factor meets `nodes`, no farther than a step away."""
+    """Return the factor at which the secant of log nodes over log factor reaches `nodes`, at most one step away."""
     x, y = np.log(np.array(tried, dtype=np.float64)).T
     goal = np.log(nodes)
     slope = response.guess
     order = np.argsort(np.abs(y - goal))
     if len(tried) > 1:
         a = order[0]
-        # The other end on the far side of the goal, if there is one, so that the secant brackets.
+        # The other end is on the far side of the goal if possible, so that the secant brackets.
         across = [b for b in order[1:] if (y[b] - goal) * (y[a] - goal) < 0.0]
         b = across[0] if across else order[1]
         if x[a] != x[b]:

@@ -1,16 +1,16 @@
 """fTetWild (Hu, Schneider, Wang, Zorin, Panozzo 2020) through pytetwild, on the soup of interfaces and box.
 
-One factor scales the sizing field and, with its 8th power, the envelope: where the interfaces alone need more nodes
-than there are, only a wider envelope helps. How the choices were made, E_D as a fraction of the image's variance:
+One factor scales the sizing field and, with its 8th power, the envelope: if the interfaces alone need more nodes than
+requested, only a wider envelope helps. Measurements behind the choices, with E_D as a fraction of the image's variance:
 
 - MNI T1, 4 classes, 5000 nodes. With an envelope of 1.35 mm, edges of 13, 25 and 49 mm give 16,755, 15,951 and 15,635
-  nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); as it is now (3.2 mm,
+  nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); currently (3.2 mm,
   triangles of 9.4 mm), 5090 nodes: 0.0312, mean rho 0.248, smallest angle 12.9 degrees, 173 s for 3 runs on a busy
   two-core machine.
 - Sphere phantom, 1500 nodes, fixed envelope: 0.0093 uniform and 0.0092 with the sizing field at 0.13 mm, 0.0149 and
-  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. As it is now: 0.0103. By hand it can be a tenth better. Two
-  spheres, as it is now: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
-- The soup, not `tetrahedralize_csg`: the latter takes no sizing field, and needs 5566 nodes for the sphere at 0.0100,
+  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. Currently: 0.0103, which tuning by hand can reduce by a
+  tenth. Two spheres, currently: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
+- The soup, not `tetrahedralize_csg`, which accepts no sizing field, and needs 5566 nodes for the sphere at 0.0100,
   where the soup has 0.0103 with 1499.
 """
 
@@ -36,60 +36,60 @@ from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
 from tetopt.system.extras import install_hint
 
-TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
-# Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.
+TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
+# Response to the factor: measured slopes are -3 to -9. Cleaver, which shares it, crashes on coarse meshes.
 TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)
-ENVELOPE_FRACTION = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
-ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, which end at small factors, are met closely
+ENVELOPE_FRACTION = 0.2  # distance that fTetWild may move a surface, over the edge of regular cells, at factor 1
+ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, with small factors, are met closely
 EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces
 EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
-STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), below which it stops: its own default
-LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) under which a cell is mended
-UNTANGLING_ROUNDS = 60  # after the boundary has been put on the box; what is inverted then cannot be mended so
+STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), at which it stops: its default
+LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) below which a cell is repaired
+UNTANGLING_ROUNDS = 60  # after the boundary is on the box; cells still inverted then cannot be repaired this way
 
 
 class Filled(NamedTuple):
-    """What `filled` returns."""
+    """Result of `filled`."""
 
     mesh: Mesh
     n_runs: int  # of fTetWild
-    search_seconds: float  # of the runs whose mesh was not taken, made to meet the number of nodes
+    search_seconds: float  # of the other runs, made to reach the number of nodes
     notes: list[str]
 
 
 def node_spacing(image: Image, nodes: int) -> float:
-    """Edge length, mm, at which regular tetrahedra fill the image's box with this many nodes."""
+    """Return the edge length, mm, at which regular tetrahedra fill the image's box with this many nodes."""
     return float((np.sqrt(2.0) * image.volume / nodes) ** (1.0 / 3.0))
 
 
 def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
-    """Tetrahedra that fill the image's box, with facets along the surfaces, and about `nodes` nodes.
+    """Fill the image's box with tetrahedra that have facets along the surfaces, and about `nodes` nodes.
 
-    One factor on the sizing field and the envelope is searched, by secants of log nodes over log factor, until the
-    number of nodes is within 5 % of the requested one; at most 6 runs, of which the nearest is taken.
+    The factor on the sizing field and the envelope is searched, by secants of log nodes over log factor, until the
+    number of nodes is within 5 % of the requested one, in at most 6 runs; the closest is used.
 
     Parameters
     ----------
     image : Image
-        3-D; its box is filled exactly.
+        3-D image; its box is filled exactly.
     surfaces : Surfaces
-        Of the same image.
+        Surfaces of the same image.
     nodes : int
         Requested number of nodes, 8 or more.
     order : {1, 2}
-        Of the cells whose nodes are counted.
+        Order of the cells whose nodes are counted.
 
     Returns
     -------
     Filled
-        Mesh in the world, every cell positively oriented, its boundary on the box's faces; a note if the number of
-        nodes could not be met.
+        Mesh in the world with positively oriented cells and its boundary on the box's faces; a note if the number of
+        nodes was missed.
 
     Raises
     ------
     InputError
-        pytetwild is not installed, fewer than 8 nodes asked for, or no run's boundary could be put on the box
-        without turning a cell inside out.
+        pytetwild is not installed; fewer than 8 nodes are requested; no run's boundary could be moved onto the box
+        without inverting a cell.
     """
     if nodes < 8:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
@@ -106,15 +106,15 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         try:
             points, cells, _ = put_on_box(*each.result, surfaces.low, surfaces.high)
         except InputError as error:
-            notes.append(f"a run with {each.n_nodes} nodes was left out: {error}")
+            notes.append(f"dropped a run with {each.n_nodes} nodes: {error}")
             continue
         world = image.to_world(points / image.spacing)
         n_nodes = node_count(points, cells, order)
         if not is_near(n_nodes, nodes):
-            notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
+            notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild, {nodes} were requested")
         search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
-    raise InputError(f"pytetwild: none of {len(runs)} meshes could be made to fill the box; ask for more nodes")
+    raise InputError(f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes")
 
 
 def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
@@ -130,7 +130,7 @@ def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
 def _run(
     tetrahedralize: Callable[..., tuple[NDArray, NDArray]], surfaces: Surfaces, edge: float, envelope: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """One run, in the box frame: the cells inside the box and the nodes they use."""
+    """Run fTetWild once, in the box frame; return the cells inside the box and their nodes."""
     diagonal = float(np.linalg.norm(surfaces.high - surfaces.low))
     field = _sizing_field(surfaces, edge)
     points, cells = tetrahedralize(
@@ -139,8 +139,8 @@ def _run(
         edge_length_abs=float(field[2].max()),
         epsilon=envelope / diagonal,
         stop_energy=STOP_ENERGY,
-        # Unfiltered: by winding numbers fTetWild would drop what nested or open interfaces enclose. What lies
-        # outside the box is dropped here.
+        # Unfiltered: winding numbers would drop the inside of nested or open interfaces. Cells outside the box
+        # are dropped here.
         disable_filtering=True,
         quiet=True,
         bg_vertices=field[0],
@@ -154,18 +154,18 @@ def _run(
 def inside_box(
     points: NDArray[np.float64], cells: NDArray[np.integer], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The cells with their centroid in the box, and the nodes that they use."""
+    """Return the cells with their centroid in the box, and their nodes."""
     middles = points[cells].mean(axis=1)
     return compacted(points, cells[((middles > low) & (middles < high)).all(axis=1)])
 
 
 def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Lattice points, tetrahedra and edges to aim for: `edge` at the interfaces, longer with the distance from them."""
+    """Return lattice points, tetrahedra and target edges: `edge` at the interfaces, growing with the distance."""
     size = surfaces.high - surfaces.low
     blocks = tuple(int(b) for b in np.clip(np.ceil(size / (0.75 * edge)), 2, 40))
     unit = lattice_mesh(Image(np.zeros((2, 2, 2))), "five-tet", blocks=blocks)
     middle = 0.5 * (surfaces.low + surfaces.high)
-    points = middle + 1.01 * ((unit.points + 0.5) / 2.0 - 0.5) * size  # a little over the box: no node may fall out
+    points = middle + 1.01 * ((unit.points + 0.5) / 2.0 - 0.5) * size  # slightly larger than the box, for all nodes
     facets = surfaces.points[surfaces.triangles[: -surfaces.n_box]]
     if len(facets) == 0:
         return points, unit.cells.astype(np.int32), np.full(len(points), edge)
@@ -177,10 +177,10 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
 def put_on_box(
     points: NDArray[np.float64], cells: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """The mesh with its boundary, which runs along the box's faces within the envelope, exactly on them.
+    """Move a mesh's boundary, which runs along the box's faces within the envelope, exactly onto them.
 
-    Each boundary facet goes onto the face it is nearest to. Cells that become flat (all four nodes on one face) are
-    dropped; cells that turn inside out are mended by moving the nodes around them, those on the box within it.
+    Each boundary facet moves to its nearest face. Cells that become flat (all four nodes on one face) are dropped;
+    inverted cells are repaired by moving the nodes around them, those on a face within it.
 
     Parameters
     ----------
@@ -193,14 +193,14 @@ def put_on_box(
     Returns
     -------
     points, cells
-        Nodes that no cell uses are gone; all volumes positive and adding up to the box's.
+        Without unused nodes; all volumes are positive and add up to the box's.
     kept : (K,) int64
-        Which of the cells these are.
+        Indices of these cells among the input's.
 
     Raises
     ------
     InputError
-        A cell that stays inverted, or a boundary that does not close to the box's.
+        A cell remains inverted, or the boundary does not match the box's.
     """
     points = points.copy()
     faces = np.stack([low, high])
@@ -218,7 +218,7 @@ def put_on_box(
     points = _untangled(points, cells, is_fixed)
     v = volumes(points, cells)
     if v.min() <= 0.0:
-        raise InputError(f"{int((v <= 0.0).sum())} cells turn inside out on the box's faces")
+        raise InputError(f"{int((v <= 0.0).sum())} cells are inverted on the box's faces")
     if abs(v.sum() / np.prod(high - low) - 1.0) > 1e-9:
         raise InputError(f"the cells fill {v.sum() / np.prod(high - low):.6f} of the box")
     return points, cells, kept
@@ -227,7 +227,7 @@ def put_on_box(
 def _box_faces_of_nodes(
     points: NDArray[np.float64], cells: NDArray[np.int64], faces: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Which faces of the box each node belongs on, (N, 2, 3) bool: those that its boundary facets are nearest to."""
+    """Mark the faces of the box that each node belongs on, (N, 2, 3) bool: the nearest to its boundary facets."""
     outer = boundary_facets(cells)
     off = np.abs(points[outer][:, :, None, :] - faces).max(axis=1).reshape(len(outer), 6)
     nearest = off.argmin(axis=1)
@@ -239,10 +239,10 @@ def _box_faces_of_nodes(
 def _untangled(
     points: NDArray[np.float64], cells: NDArray[np.int64], is_fixed: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Nodes of inverted and nearly flat cells moved until all volumes are positive, or `UNTANGLING_ROUNDS` are over.
+    """Move nodes of inverted and nearly flat cells until all volumes are positive, for at most `UNTANGLING_ROUNDS`.
 
-    `is_fixed` (N, 3) marks the coordinates that must stay. A node goes part of the way to its neighbours' middle if
-    the smallest relative volume around it (volume over its longest edge's cube) grows.
+    `is_fixed` (N, 3) marks fixed coordinates. A node moves part of the way to its neighbours' middle if the smallest
+    relative volume around it (volume over its longest edge's cube) grows.
     """
     points = points.copy()
     around = [np.flatnonzero(False)] * len(points)
@@ -264,7 +264,7 @@ def _untangled(
 
 
 def _improve(points: NDArray[np.float64], star: NDArray[np.int64], node: int, is_free: NDArray[np.bool_]) -> bool:
-    """Move one node to the best of a few places near; whether it moved."""
+    """Move one node to the best of a few nearby places; return whether it moved."""
     corners = points[star]
     is_node = star == node
     start = points[node].copy()
@@ -285,7 +285,7 @@ def _improve(points: NDArray[np.float64], star: NDArray[np.int64], node: int, is
 
 
 def _relative_volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Volume over the cube of the longest edge, (M,), of corners (M, 4, 3); negative if inverted."""
+    """Return volume over the cube of the longest edge, (M,), for corners (M, 4, 3); negative if inverted."""
     frames = corners[:, 1:] - corners[:, :1]
     a, b, c = frames[:, 0], frames[:, 1], frames[:, 2]
     volume = (np.cross(a, b) * c).sum(axis=1) / 6.0

@@ -1,4 +1,4 @@
-"""What each option of a graded mesh trades: runs around the defaults, one option at a time."""
+"""Trade-offs of a graded mesh's options: runs around the defaults, one option at a time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.sizes import COARSEST_RATIO, Sizes
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
 
-# An option, its defaults and values around them by the order of the cells, and what `mesh_image` gets for a value.
+# An option, its defaults and values around them by order of the cells, and the arguments of `mesh_image` for a value.
 SweptOption = tuple[str, dict[int, float | None], dict[int, tuple[float, ...]], Callable[[float], dict[str, Any]]]
 SWEPT_OPTIONS: tuple[SweptOption, ...] = (
     ("k_D", dict.fromkeys((1, 2), GRADED_K_D), dict.fromkeys((1, 2), (0.3, 0.5, 0.7, GRADED_K_D, 0.93)),
@@ -31,11 +31,11 @@ SWEPT_OPTIONS: tuple[SweptOption, ...] = (
 
 
 def tradeoff(image: Image, nodes: int, order: int, measure: Callable[[Mesh, int], Measurement]) -> list[TradeoffRow]:
-    """Meshes over `SWEPT_OPTIONS` whose cells of this order have about `nodes` nodes in all, each with its measurement.
+    """Mesh and measure `SWEPT_OPTIONS`, with about `nodes` nodes in total for cells of this order.
 
-    The default's mesh is made once.
+    The default's mesh is built once.
     """
-    measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
+    measurements: dict[tuple[str, float] | None, Measurement] = {}  # by the changed option; None: the defaults
     rows = []
     for option, defaults, values, arguments in SWEPT_OPTIONS:
         for value in values[order]:

@@ -1,1 +1,1 @@
-"""What the package needs of the machine: processes, memory, files, untrusted input, compiled kernels."""
+"""The interface to the machine: processes, memory, files, untrusted input, compiled kernels."""

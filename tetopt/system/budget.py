@@ -1,8 +1,8 @@
-"""What memory there is, and that nothing is begun which needs more: it is said in one line, before it is taken.
+"""Available memory, and checks that refuse work which needs more of it, in one line, before the work starts.
 
-Limits of a process (RLIMIT_AS, RLIMIT_DATA, as `ulimit` and schedulers set them) make an allocation fail. Those of a
-control group (containers, clusters) and of the machine end the process without a word, so that only asking before
-helps.
+Limits of a process (RLIMIT_AS, RLIMIT_DATA, as `ulimit` and schedulers set them) make an allocation fail. The limits of
+a control group (containers, clusters) and of the machine kill the process without a message, so they must be checked
+in advance.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-BYTES_PER_GB = 1e9  # as of memory that is sold and of files
-MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
-LIBRARY_ADDRESSES = 1.2e9  # libraries, stacks and buffers of threads, all kernels: 1.1 GB on two cores, of 0.3 in use
+BYTES_PER_GB = 1e9  # decimal, as for files
+MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss, see getrusage(2)
+LIBRARY_ADDRESSES = 1.2e9  # libraries, thread stacks and buffers, all kernels: 1.1 GB on two cores, 0.3 GB resident
 PROC_FOLDER = Path("/proc")
 GROUP_FOLDER = Path("/sys/fs/cgroup")
-UNLIMITED_BYTES = 1 << 60  # of a control group's: "no limit" is a number near 2^63 there
+UNLIMITED_BYTES = 1 << 60  # control groups write "no limit" as a number near 2^63
 
 
 def memory_words(n_bytes: float) -> str:
-    """A number of bytes in words."""
+    """Format a number of bytes."""
     return f"{n_bytes / BYTES_PER_GB:.3g} GB" if n_bytes >= 1e8 else f"{n_bytes / 1e6:.3g} MB"
 
 
 def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = None) -> None:
-    """InputError if what is about to be done needs more memory than there is, or than `limit`, bytes.
+    """Raise InputError if the next step needs more memory than is available, or than `limit`, bytes.
 
     Parameters
     ----------
     n_bytes : float
-        What it will need besides what this process has.
+        Memory that the step needs in addition to what this process has.
     what : str
-        That needs it, with its sizes, as a message begins.
+        The step with its sizes; begins the message.
     advice : str
-        What to do instead, as a message ends.
+        The remedy; ends the message.
     limit : float, optional
-        Of the user's own, of all that this process has.
+        The user's limit on the total memory of this process.
     """
     free = available_bytes()
     if n_bytes > free:
@@ -54,37 +54,37 @@ def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = N
         )
     if limit is not None and n_bytes + resident_bytes() > limit:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in all, "
+            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in total, "
             f"{memory_words(limit)} are allowed; {advice}"
         )
 
 
 class MemoryLimit(NamedTuple):
-    """A limit of the user's own, and what the next steps of a run may take besides what there is."""
+    """The user's memory limit, and the additional memory that the next steps of a run may take."""
 
     n_bytes: float
     next_bytes: float
 
     def is_reached(self) -> bool:
-        """Whether to end, lest it be exceeded."""
+        """Return whether the run must end so as not to exceed the limit."""
         return resident_bytes() + self.next_bytes > self.n_bytes
 
 
 def check_addresses() -> None:
-    """InputError where the limit of a process (`ulimit -v`) leaves too few addresses to load numba and the like.
+    """Raise InputError if the process limit (`ulimit -v`) leaves too little address space to load numba and others.
 
-    Libraries end the process where they find none: OpenBLAS and LLVM exit, others cannot be imported.
+    Without address space, OpenBLAS and LLVM end the process, and other libraries fail to import.
     """
     room = address_room()
     if room is not None and room < LIBRARY_ADDRESSES:
         raise InputError(
-            f"the limit on this process leaves {memory_words(room)} of addresses, numba and the other libraries need "
-            f"{memory_words(LIBRARY_ADDRESSES)}; raise it (ulimit -v, ulimit -d)"
+            f"the process limit leaves {memory_words(room)} of address space, numba and other libraries need "
+            f"{memory_words(LIBRARY_ADDRESSES)}; raise the limit (ulimit -v, ulimit -d)"
         )
 
 
 def available_bytes() -> int:
-    """Memory that could be had without swapping, within all limits."""
+    """Return the memory available without swapping, within all limits."""
     import psutil
 
     rooms = [psutil.virtual_memory().available, _group_bytes(), *_process_bytes()]
@@ -92,16 +92,16 @@ def available_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    """Memory that this process has now."""
+    """Return the resident memory of this process."""
     import psutil
 
     return psutil.Process().memory_info().rss
 
 
 def address_bytes() -> int:
-    """Address space that this process has taken; 0 where the system does not say.
+    """Return the address space in use by this process; 0 where the system does not report it.
 
-    Children that read a file ask for it, so that psutil is not loaded for it: that takes a tenth of their time.
+    Children that read a file call this, so it does without psutil, whose import would take a tenth of their time.
     """
     try:
         pages = (PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[0]
@@ -111,9 +111,9 @@ def address_bytes() -> int:
 
 
 def peak_bytes(pid: int | None = None) -> int:
-    """The most memory that a process has had, this one by default; 0 if it has ended, or the system does not say.
+    """Return the peak memory of a process, by default this one; 0 if it has ended or the system does not report it.
 
-    On Linux VmHWM, not ru_maxrss: the latter begins at the memory of the parent that started the process.
+    On Linux this is VmHWM, not ru_maxrss, which starts at the memory of the parent that started the process.
     """
     try:
         status = (PROC_FOLDER / str(pid or "self") / "status").read_text(encoding="ascii", errors="replace")
@@ -125,7 +125,7 @@ def peak_bytes(pid: int | None = None) -> int:
 
 
 def family_peak_bytes() -> int:
-    """The most memory that this process has had, or one that it has waited for."""
+    """Return the peak memory of this process and of the children that it has waited for."""
     return max(peak_bytes(), 0 if resource is None else _maxrss(resource.RUSAGE_CHILDREN))
 
 
@@ -134,13 +134,13 @@ def _maxrss(who: int) -> int:
 
 
 def address_room() -> int | None:
-    """Address space that this process may still take, where there is a limit to it."""
+    """Return the address space that this process may still take; None without a limit."""
     rooms = _process_bytes()
     return min(rooms, default=None)
 
 
 def _process_bytes() -> list[int]:
-    """What the limits of this process leave, of each that is set."""
+    """Return what each limit set on this process leaves."""
     names = {"RLIMIT_AS": "vms", "RLIMIT_DATA": "data"}
     limits = {used: resource.getrlimit(getattr(resource, name))[0] for name, used in names.items() if resource}
     if all(limit == resource.RLIM_INFINITY for limit in limits.values()):
@@ -156,7 +156,7 @@ def _process_bytes() -> list[int]:
 
 
 def _group_bytes() -> int | None:
-    """What the control groups of this process leave, of version 2 or 1; what files take there can be had."""
+    """Return what the control groups (version 2 or 1) of this process leave; the file cache counts as free."""
     try:
         rows = (PROC_FOLDER / "self" / "cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -172,7 +172,7 @@ def _group_bytes() -> int | None:
         else:
             continue
         folder = root / path.lstrip("/")
-        # A container sees its own group as the root, whatever its path is called outside; parents limit, too.
+        # A container sees its own group as the root, whatever its path is outside; the limits of parents apply too.
         for at in {root, *(part for part in (folder, *folder.parents) if part.is_relative_to(root))}:
             room = _group_room(at, *names)
             if room is not None:

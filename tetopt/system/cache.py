@@ -1,6 +1,6 @@
-"""Where compiled kernels are kept: beside the package, else in the user's cache, else only as long as the process.
+"""The folder of compiled kernels: beside the package, else the user's cache, else a temporary one for this process.
 
-Those beside the package are read in any case.
+Kernels beside the package are always read.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-# Of what is made here, whatever the mask: only the owner may write.
+# Modes of new folders and files, whatever the umask: only the owner may write.
 FOLDER_MODE, FILE_MODE = 0o755, 0o644
 
 
 class Place(NamedTuple):
-    """Where numba keeps what it compiles."""
+    """The place where numba keeps compiled code."""
 
-    folder: Path | None  # None: nowhere
-    notice: str | None  # what to tell the user, if it is not kept for later runs
+    folder: Path | None  # None if there is none
+    notice: str | None  # a message for the user if kernels are not kept for later runs
 
 
 @cache
 def place_cache() -> Place:
-    """See to it that numba finds a folder for its cache, at least a temporary one.
+    """Make sure that numba finds a folder for its cache, at least a temporary one.
 
-    numba looks in NUMBA_CACHE_DIR, else beside the source, else in the user's cache folder. What it reads there is
-    code that it runs: a folder that everybody may write is not used, whoever it belongs to. In folders within it, and
-    beside the source, nobody else may write at all (`untrusted`).
+    numba looks in NUMBA_CACHE_DIR, else beside the source, else in the user's cache folder, and runs the code that it
+    reads there. World-writable folders are therefore not used, whoever owns them. Subfolders, and the folder beside
+    the source, must not be writable by anyone else at all (`untrusted`).
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     beside = Path(__file__).parents[1] / "__pycache__"
@@ -45,24 +45,24 @@ def place_cache() -> Place:
             _point_numba_to(usable[0])
         return Place(usable[0], None)
     temporary = None
-    with contextlib.suppress(OSError):  # there is nowhere to write at all
+    with contextlib.suppress(OSError):  # no folder is writable
         temporary = Path(tempfile.mkdtemp(prefix="tetopt-kernels-"))
     if temporary is not None:
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         _point_numba_to(temporary)
     return Place(
         temporary,
-        f"kernels are compiled anew in each run, {'half a minute' if temporary else 'a minute'}: "
+        f"each run recompiles the kernels, which takes {'half a minute' if temporary else 'a minute'}: "
         f"{' and '.join(f'{folder} {refusal}' for folder, refusal in refusals)}; "
         "set NUMBA_CACHE_DIR to a folder that only you can write",
     )
 
 
 def untrusted(status: os.stat_result) -> str | None:
-    """Return who else can have written a file or folder of the cache, in words; None if nobody can.
+    """Return why a file or folder of the cache is not trusted, in words; None if it is.
 
-    This user, root and the owner of the package can: each of them may run code in this process anyway. The status is
-    that of `os.lstat`, as a link is not followed.
+    Trusted owners are this user, root and the owner of the package: they may run code in this process anyway. The
+    status comes from `os.lstat`, because links are not followed.
     """
     if os.name != "posix":
         return None
@@ -71,7 +71,7 @@ def untrusted(status: os.stat_result) -> str | None:
     if status.st_uid not in (os.geteuid(), 0, os.stat(__file__).st_uid):
         return f"belongs to user {status.st_uid}"
     is_open = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return "can be written by others than its owner" if is_open else None
+    return "is writable by users other than its owner" if is_open else None
 
 
 def _point_numba_to(folder: Path) -> None:
@@ -81,8 +81,8 @@ def _point_numba_to(folder: Path) -> None:
 
 
 def _user_cache() -> Path:
-    """As numba has it."""
-    home = Path(os.path.expanduser("~"))  # "~" itself where nobody knows one
+    """Return the user's cache folder, as numba determines it."""
+    home = Path(os.path.expanduser("~"))  # "~" itself if there is no home
     home = home if home.is_absolute() else Path(os.devnull)
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
@@ -92,9 +92,9 @@ def _user_cache() -> Path:
 
 
 def _refusal(folder: Path, *, is_within: bool) -> str | None:
-    """Why a folder is none for the cache, made if it is not there; numba's way to see: rights alone do not tell.
+    """Return why a folder cannot hold the cache; create it if missing and write to it, as permissions do not suffice.
 
-    `is_within`: it has the files itself, not folders of them.
+    `is_within`: the folder holds the files themselves, not subfolders with them.
     """
     try:
         for part in [*reversed(folder.parents), folder]:
@@ -106,5 +106,5 @@ def _refusal(folder: Path, *, is_within: bool) -> str | None:
             return untrusted(os.lstat(folder))
         is_open = os.name == "posix" and folder.stat().st_mode & stat.S_IWOTH
     except OSError:
-        return "cannot be written"
-    return "can be written by everybody" if is_open else None
+        return "is not writable"
+    return "is world-writable" if is_open else None

@@ -1,9 +1,9 @@
-"""Child processes within limits: how they are started, watched and ended, and how they end, in words.
+"""Child processes within limits: starting, watching and ending them, and describing how they ended.
 
-A child with a folder of its own ends with all that it starts, whatever process group or session that makes for itself:
-it counts for the limits, too. Where the parent is killed and can see to nothing any more, a shell that waits for its
-end does. Windows has neither sessions nor that shell: there a child ends with those that descend from it, and is left
-alone by a parent that is killed.
+A child with its own folder ends together with every process that it starts, whatever process group or session those
+create for themselves; they also count towards the limits. If the parent is killed, a shell that waits for its end
+cleans up. Windows has neither sessions nor that shell: there a child ends together with its descendants, and survives a
+parent that is killed.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import psutil  # loaded where it is used: many processes only look up a signal or limit themselves
+    import psutil  # imported where it is used: many processes only look up a signal or set their own limits
 
 try:
     import resource
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-POLL_SECONDS = 0.05  # between two looks at a child: a fraction of what even a short run takes
-KILL_ROUNDS = 40  # of looking for what is left of a child, `POLL_SECONDS` apart: what was killed may have forked before
-MARK_NAME = "TETOPT_CHILD"  # in the environment of whatever a child starts: the child's folder
-DEATH_OPTION = 1  # PR_SET_PDEATHSIG, of prctl(2)
-# Waits until its standard input closes, which the parent's end does, however it comes.
+POLL_SECONDS = 0.05  # between two polls of a child: a fraction of even a short run
+KILL_ROUNDS = 40  # searches for remaining processes, `POLL_SECONDS` apart: a killed process may have forked before
+MARK_NAME = "TETOPT_CHILD"  # names the child's folder in the environment of every process that a child starts
+DEATH_OPTION = 1  # PR_SET_PDEATHSIG of prctl(2)
+# Waits until its standard input closes, which happens when the parent ends for any reason.
 WATCHDOG = 'read -r _; kill -9 -"$1"; sleep 0.2; rm -rf "$2"'
-# Of those that end a program which did not ask for it; a shell that ran it then ends with 128 more.
+# Signals of a crash; a shell that ran the program then exits with 128 more.
 CRASH_SIGNALS = ("SIGILL", "SIGTRAP", "SIGABRT", "SIGBUS", "SIGFPE", "SIGKILL", "SIGSEGV")
 SHELL_OFFSET = 128  # what a shell adds to a signal's number
 
@@ -42,22 +42,22 @@ SHELL_OFFSET = 128  # what a shell adds to a signal's number
 def started(
     command: Sequence[str], environment: dict[str, str], folder: Path | None = None, **streams: Any
 ) -> Iterator[subprocess.Popen]:
-    """Run a child process within a block; it is killed at the block's end, and its `returncode` is known then.
+    """Run a child process within a block; at the end of the block it is killed and its `returncode` is set.
 
     Parameters
     ----------
     command : sequence of str
     environment : dict
     folder : Path, optional
-        The child's own: all that the child has started ends with it, also if this process is killed, and then the
-        folder is removed. Without a folder the child ends alone.
+        The child's own folder: every process that the child has started ends with it, also if this process is
+        killed, in which case the folder is removed. Without a folder only the child itself is ended.
     **streams
-        Of `subprocess.Popen`: `stdin`, of which there is none by default, `stdout`, `stderr`.
+        Arguments of `subprocess.Popen`: `stdin` (none by default), `stdout`, `stderr`.
     """
     child = subprocess.Popen(
         command,
         env=environment | ({} if folder is None else {MARK_NAME: str(folder)}),
-        start_new_session=folder is not None,  # a group of its own, which is killed as a whole, and hears no Ctrl-C
+        start_new_session=folder is not None,  # its own group, which is killed as a whole and does not get Ctrl-C
         **{"stdin": subprocess.DEVNULL} | streams,
     )
     try:
@@ -73,7 +73,7 @@ def started(
 
 @contextlib.contextmanager
 def _guarded(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
-    """A shell beside that ends the child's group, and takes its folder away, if this process ends before the block."""
+    """Run a shell that kills the child's group and removes its folder if this process ends before the block does."""
     if folder is None or sys.platform == "win32":
         yield
         return
@@ -97,11 +97,11 @@ def watched(
     ----------
     child : subprocess.Popen
     seconds : float
-        Between two looks at it.
+        Time between two polls.
     measure : callable
-        The memory of the process of a number, bytes.
+        Takes a process id and returns the memory of that process, bytes.
     problem : callable
-        Gets the largest memory measured; a reason to wait no longer, or None.
+        Takes the largest memory measured and returns a reason to stop waiting, or None.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def watched(
 
 
 def family_bytes(pid: int) -> int:
-    """Resident memory of a child with a folder of its own, and of all that it has started."""
+    """Return the resident memory of a child with its own folder and of all processes that it has started."""
     import psutil
 
     total = 0
@@ -133,11 +133,11 @@ def family_bytes(pid: int) -> int:
 
 
 def _family(session: int) -> set[psutil.Process]:
-    """The processes of a session, and all that descend from them; zombies among the latter, too."""
+    """Return the processes of a session and all their descendants, including zombies."""
     import psutil
 
     family: set[psutil.Process] = set()
-    session_of = getattr(os, "getsid", int)  # on Windows each is alone
+    session_of = getattr(os, "getsid", int)  # on Windows each process is its own session
     for pid in psutil.pids():
         with contextlib.suppress(psutil.Error, OSError):  # it has ended meanwhile
             if session_of(pid) == session and (process := psutil.Process(pid)) not in family:
@@ -146,25 +146,25 @@ def _family(session: int) -> set[psutil.Process]:
 
 
 def _marked(folder: Path) -> set[psutil.Process]:
-    """The processes that were started for a child with this folder, orphans among them."""
+    """Return the processes that were started for a child with this folder, including orphans."""
     import psutil
 
     processes = set()
     for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, OSError):  # it has ended meanwhile, or is not ours to look at
+        with contextlib.suppress(psutil.Error, OSError):  # it has ended meanwhile, or access is denied
             if process.environ().get(MARK_NAME) == str(folder):
                 processes.add(process)
     return processes
 
 
 def _kill_all(child: subprocess.Popen, folder: Path) -> None:
-    """End whatever is left of the child and of all that it started, and collect the child."""
+    """Kill the child and all remaining processes that it started, and reap the child."""
     import psutil
 
     for _ in range(KILL_ROUNDS):
         n_left = 0
         for each in _family(child.pid) | _marked(folder):
-            with contextlib.suppress(psutil.Error):  # it has ended meanwhile, or has other rights
+            with contextlib.suppress(psutil.Error):  # it has ended meanwhile, or access is denied
                 n_left += each.status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
                 each.kill()
         child.wait()
@@ -177,20 +177,20 @@ def _kill_all(child: subprocess.Popen, folder: Path) -> None:
 
 
 def limit_self(name: str, value: float) -> None:
-    """Lower a limit of this process, as `RLIMIT_AS`, where the system has it."""
+    """Lower a limit of this process, such as `RLIMIT_AS`, where the system has it."""
     if resource is None:
         return
     kind = getattr(resource, name)
     hard = resource.getrlimit(kind)[1]
-    with contextlib.suppress(ValueError, OSError):  # macOS has no such limit of memory
+    with contextlib.suppress(ValueError, OSError):  # macOS has no such memory limit
         resource.setrlimit(kind, (int(value if hard == resource.RLIM_INFINITY else min(value, hard)), hard))
 
 
 def end_with_parent() -> None:
-    """From now on this process is killed as soon as the one that started it ends, on Linux; elsewhere nothing happens.
+    """On Linux, have this process killed as soon as its parent ends; elsewhere do nothing.
 
-    Where a thread started it, with that thread. A process sees such an end by itself only when it comes to look, which
-    one in a compiled kernel does not.
+    If a thread started the process, the end of that thread counts. Without this, a process notices the end of its
+    parent only when it checks, which it does not do within a compiled kernel.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(DEATH_OPTION, signal.SIGKILL)
@@ -200,9 +200,9 @@ def end_with_parent() -> None:
 
 
 def signal_words(code: int) -> str | None:
-    """The signal that ended a process of this return code, as "signal 11, SIGSEGV"; None if it ended by itself.
+    """Return the signal behind a return code, e.g. "signal 11, SIGSEGV"; None if the process exited by itself.
 
-    A negative code is that of the process itself; one of 128 more is what a shell makes of its program's crash.
+    A negative code comes from the process itself; a code above 128 comes from a shell whose program crashed.
     """
     number = -code if code < 0 else code - SHELL_OFFSET
     try:

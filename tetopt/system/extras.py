@@ -1,28 +1,31 @@
-"""How what is not installed with tetopt itself, but some of its work needs, can be installed."""
+"""Commands that install the optional libraries of tetopt."""
 
 from __future__ import annotations
 
 import re
 from importlib import metadata
 
-REQUIREMENT = re.compile(r"(?P<name>[\w.-]+) *(?P<versions>[^;\[]*?) *; *extra *== *['\"](?P<extra>[\w.-]+)['\"]")
+# A line of the metadata: "name>=1.0; extra == 'itk'", or with a condition on Python before the extra.
+REQUIREMENT = re.compile(
+    r"(?P<name>[\w.-]+) *(?P<versions>[^;\[]*?) *;(?:[^;]+ and)? *extra *== *['\"](?P<extra>[\w.-]+)['\"]"
+)
 
 
 def install_hint(extra: str, *packages: str) -> str:
-    """The command that installs packages of one of tetopt's extras, of the versions that tetopt's metadata states.
+    """Return the command that installs packages of one of tetopt's extras, in the versions that tetopt requires.
 
-    The packages themselves are named, as ``pip install "tetopt[...]"`` works only where an index has tetopt.
+    The command names the packages, because ``pip install "tetopt[...]"`` works only where an index has tetopt.
 
     Parameters
     ----------
     extra : str
-        Whose versions are taken; packages that it does not name are asked for in any version.
+        The extra that gives the versions; packages that it does not name get no version.
     *packages : str
 
     Returns
     -------
     str
-        To be pasted into any shell: in double quotes, within which neither bash nor Windows' takes > for a file.
+        A command for any shell: double quotes keep both bash and Windows from reading > as a redirection.
 
     Examples
     --------
@@ -39,7 +42,7 @@ def install_hint(extra: str, *packages: str) -> str:
 
 
 def pip_install(*requirements: str) -> str:
-    """The command that installs these, quoted for any shell.
+    """Return the command that installs these requirements, quoted for any shell.
 
     Examples
     --------
@@ -50,5 +53,5 @@ def pip_install(*requirements: str) -> str:
 
 
 def _normal(name: str) -> str:
-    """A package's name as the metadata may spell it (PyPA's name normalisation)."""
+    """Normalise a package's name (PyPA's rules), as metadata may spell it differently."""
     return re.sub(r"[-_.]+", "-", name).lower()

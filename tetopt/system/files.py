@@ -1,7 +1,7 @@
-"""Outputs that appear whole or not at all, and never over something else by accident.
+"""Outputs that appear whole or not at all, and never replace other files by accident.
 
-All files that tetopt leaves come to be in `written_whole`: on a temporary name beside their own, synchronised to the
-disk, and from there in one step to their name.
+tetopt writes all its files by `written_whole`: under a temporary name in the same folder, synchronised to disk, and
+then renamed in one step.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ import numpy as np
 
 from tetopt.errors import InputError
 
-TEMPORARY_LETTERS = 40  # of an output's name that its temporary one begins with: names may be as long as they can be
-# What a folder answers that cannot be synchronised at all, as those of some network file systems.
+TEMPORARY_LETTERS = 40  # letters of an output's name in its temporary name: the name may have the maximum length
+# Errors of folders that cannot be synchronised at all, as on some network file systems.
 UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EBADF)
 
 
 class TakenError(InputError):
-    """An output's name was taken by another program during the run; what was to be written is kept beside it."""
+    """Another program took the output's name during the run; the output is kept beside it."""
 
 
 class Outputs(NamedTuple):
     """The outputs of one command."""
 
-    named: list[Path]  # all files and folders that its options name, inputs as well
-    may_replace: dict[Path, bool]  # of each output that was checked, whether what lies there by now may go
-    places: dict[Path, Path]  # where it really lies, links followed
-    written: list[Path]  # of those checked
-    made: list[Path]  # folders for the outputs that were not there before
+    named: list[Path]  # all files and folders that its options name, including inputs
+    may_replace: dict[Path, bool]  # for each checked output, whether it may replace an existing file
+    places: dict[Path, Path]  # for each checked output, its real place with links followed
+    written: list[Path]  # checked outputs that have been written
+    made: list[Path]  # folders created for the outputs
 
 
 _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
@@ -47,11 +47,10 @@ _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 
 @contextmanager
 def outputs_of_command() -> Iterator[Outputs]:
-    """Within it, outputs checked by `checked_output` are a command's.
+    """Treat the outputs checked by `checked_output` within a block as those of one command.
 
-    None of them may be one of its inputs, nor two of them the same; one that was not there when it was checked is not
-    replaced if it is there when it is written, unless by `force`. Of the folders that `results_folder` made none stays
-    that is empty at the end.
+    An output must not be one of the inputs, nor the same as another output. A file that appeared after the check is
+    not replaced without `force`. Folders made by `results_folder` that are empty at the end are removed.
     """
     outputs = Outputs([], {}, {}, [], [])
     token = _OUTPUTS.set(outputs)
@@ -60,13 +59,13 @@ def outputs_of_command() -> Iterator[Outputs]:
     finally:
         _OUTPUTS.reset(token)
         for folder in reversed(outputs.made):
-            with suppress(OSError, ValueError):  # it holds something, is another's by now, or has no such name
+            with suppress(OSError, ValueError):  # it is not empty, has been replaced, or has an invalid name
                 folder.rmdir()
 
 
 @contextmanager
 def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
-    """As `outputs_of_command`, for a run with these options that no command has begun."""
+    """Do the same as `outputs_of_command` for a run with these options outside a command."""
     if _OUTPUTS.get() is not None:
         yield
         return
@@ -76,16 +75,16 @@ def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
 
 
 def name_files(values: Iterable[Any]) -> None:
-    """Note the paths among the values of a command's options, of which none may be named twice if one is an output."""
+    """Record the paths among the values of a command's options; no output may be named twice."""
     if (outputs := _OUTPUTS.get()) is not None:
         flat = (each for value in values for each in (value if isinstance(value, list) else [value]))
         outputs.named.extend(each for each in flat if isinstance(each, Path))
 
 
 def results_folder(path: Path) -> Path:
-    """`path`, made with the folders above it if it is not there; InputError for a file, or where none can be made.
+    """Return `path`, created with its parents if missing; InputError for a file, or if it cannot be created.
 
-    Of a command that is refused afterwards no empty folder is left.
+    A command that is refused afterwards leaves no empty folder.
     """
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{path}: expected a folder for the results, found a file")
@@ -94,43 +93,43 @@ def results_folder(path: Path) -> Path:
         outputs.made.extend(new)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not take
+    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not allow
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: the folder for the results cannot be made: {reason}") from error
+        raise InputError(f"{path}: cannot create the folder for the results: {reason}") from error
     return path
 
 
 def checked_output(
     path: str | Path, suffixes: tuple[str, ...], force: bool = False, is_ours: Callable[[Path], bool] | None = None
 ) -> Path:
-    """`path` if a file may be written there, asked before the work starts; a file is made in its folder, and removed.
+    """Return `path` if an output may be written there; checks by creating and removing a file in its folder.
 
-    With `force` the file that a symbolic link points to is what is written, and the link stays. `is_ours` is of an
-    output that is a folder: whether a folder is of its kind, as which alone `force` replaces it.
+    Call it before the work starts. With `force` and a symbolic link, the file that the link points to is written and
+    the link stays. `is_ours` is for outputs that are folders: it says whether an existing folder may be replaced.
 
     Raises
     ------
     InputError
-        A suffix not among `suffixes` (of any case), a missing or read-only folder, a folder or a device in the file's
-        place, an existing file without `force`, an input of the command or another of its outputs.
+        The suffix is not among `suffixes` (in any case); the folder is missing or read-only; a folder or device is in
+        the place of the file; the file exists and `force` is not set; the command uses it as an input or output too.
     """
     path = check_suffix(path, suffixes)
     if os.path.isdir(path) and (is_ours is None or not is_ours(path)):
-        raise InputError(f"{path}: expected a file to write, found a folder{'' if is_ours is None else ' of others'}")
+        raise InputError(f"{path}: expected a file to write, found a{'' if is_ours is None else 'n unrelated'} folder")
     try:
         place = Path(os.path.realpath(path))
         before = _state(place)
-    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not take
+    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not allow
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     through = f"is a link to {place}: " if path.is_symlink() else ""
     if not place.parent.is_dir():
-        raise InputError(f"{path}: {through}its folder does not exist; make it first")
+        raise InputError(f"{path}: {through}its folder does not exist; create it first")
     if before is not None and is_ours is not None and not stat.S_ISDIR(before.st_mode):
         raise InputError(f"{path}: {through}expected a folder to write, found something else; remove it first")
     if before is not None and is_ours is None and not stat.S_ISREG(before.st_mode):
-        raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a link in a circle")
+        raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a circular link")
     if os.path.lexists(path) and not force:
-        raise InputError(f"{path}: exists already; pass `force` to replace it")
+        raise InputError(f"{path}: already exists; pass `force` to replace it")
     _check_once(path, place)
     _check_folder(path, place.parent)
     if (outputs := _OUTPUTS.get()) is not None:
@@ -140,15 +139,15 @@ def checked_output(
 
 
 def check_suffix(path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    """The path, if its name ends in one of the suffixes, of any case; else InputError."""
+    """Return the path; InputError unless its name ends in one of the suffixes, in any case."""
     path = Path(path)
     if not path.name.lower().endswith(suffixes):
-        raise InputError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
+        raise InputError(f"{path}: expected a name ending in {' or '.join(suffixes)}")
     return path
 
 
 def _check_once(path: Path, place: Path) -> None:
-    """InputError if the command names the file a second time: as an input, or as another output."""
+    """Raise InputError if the command names the file a second time, as an input or as another output."""
     if (outputs := _OUTPUTS.get()) is None:
         return
     others = list(outputs.named)
@@ -157,42 +156,42 @@ def _check_once(path: Path, place: Path) -> None:
     if any(os.path.realpath(other) == str(place) for other in others) or (
         place.exists() and any(other.exists() and place.samefile(other) for other in others)
     ):
-        raise InputError(f"{path}: is an input of this command too, or another output; write somewhere else")
+        raise InputError(f"{path}: is also an input or another output of this command; choose another name")
 
 
 def _check_folder(path: Path, folder: Path) -> None:
-    """InputError unless the folder takes a new file: rights alone do not tell."""
+    """Raise InputError unless a file can be created in the folder: permissions alone do not tell."""
     try:
         handle, name = tempfile.mkstemp(prefix=".tetopt-", dir=folder)
         os.close(handle)
         os.unlink(name)
     except OSError as error:
-        raise InputError(f"{path}: its folder cannot be written to: {error.strerror}") from error
+        raise InputError(f"{path}: its folder is not writable: {error.strerror}") from error
 
 
 def check_space(path: Path, n_bytes: int) -> None:
-    """InputError if the disk of `path` has not so many bytes free, as far as it tells."""
+    """Raise InputError if the disk of `path` has fewer than `n_bytes` bytes free, as far as it reports them."""
     free = shutil.disk_usage(os.path.realpath(path.parent)).free
     if free < n_bytes:
-        raise InputError(f"{path}: takes some {n_bytes} bytes or more, {free} are free; make room first")
+        raise InputError(f"{path}: needs at least {n_bytes} bytes, {free} are free; free some space first")
 
 
 @contextmanager
 def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """A temporary path beside `path`, with its suffix, that takes its place when the block ends without error.
+    """Give a temporary path beside `path`, with its suffix, that replaces `path` when the block ends without error.
 
-    Left behind by an error or an interruption is nothing but what was there before; by a killed process or a power cut
-    the whole file, old or new, and perhaps the temporary one, whose name begins with a dot. The new file has the rights
-    of the one that it replaces, and its group, where that is allowed; a file that is new those of any other.
+    After an error or an interruption, the previous file is unchanged. After a kill or a power cut, the old or the new
+    file is whole, and a temporary file, whose name begins with a dot, may remain. The new file keeps the permissions
+    and, where allowed, the group of the file that it replaces; otherwise it gets the default permissions.
 
     Raises
     ------
     TakenError
-        `checked_output` saw no file there, and now there is one.
+        A file has appeared there since `checked_output`.
     OSError
-        Any other reason, with the path and, on a full disk, the number of bytes (`n_bytes`) if it is known.
+        Any other failure, with the path and, on a full disk, the number of bytes (`n_bytes`) if known.
     """
-    # not `path.suffixes`, which passes over dots that lead: of "..nii.gz" it knows .gz alone
+    # Not `path.suffixes`, which skips leading dots: for "..nii.gz" it has only .gz.
     suffix = "".join(f".{part}" for part in path.name.split(".")[1:][-2:])[-20:]
     with _output(path, n_bytes) as (place, may_replace):
         handle, name = tempfile.mkstemp(prefix=_hidden(path), suffix=suffix, dir=place.parent)
@@ -206,20 +205,20 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
             elif not _linked(temporary, place):
                 kept = _beside(temporary, path)
                 raise TakenError(
-                    f"{path}: another program has written it in the meantime, and without `force` it stays as it is; "
-                    f"what was to be written is in {kept}"
+                    f"{path}: another program has written this file in the meantime; it is kept, as `force` is not "
+                    f"set, and the output is in {kept}"
                 )
             _synchronise_folder(place.parent)
         finally:
-            with suppress(OSError):  # then a hidden file stays, and what is told is what went wrong before
+            with suppress(OSError):  # then a hidden file remains, and the first error is reported
                 os.unlink(temporary)
 
 
 @contextmanager
 def _output(path: Path, n_bytes: int | None = None) -> Iterator[tuple[Path, bool]]:
-    """Where an output really lies, and whether it may replace what is there by now; noted as written after the block.
+    """Give an output's real place and whether it may replace an existing file; record it as written after the block.
 
-    Errors of the system within it are those of writing `path`.
+    System errors within the block are reported as errors of writing `path`.
     """
     outputs, key = _OUTPUTS.get(), _absolute(path)
     place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
@@ -231,12 +230,12 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[tuple[Path, bool
 
 
 def _hidden(path: Path) -> str:
-    """The start of the names of an output's temporary files and folders."""
+    """Return the prefix of an output's temporary files and folders."""
     return f".{path.name[:TEMPORARY_LETTERS]}."
 
 
 def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = "") -> Path:
-    """A folder beside an output until the stack is unwound; what cannot be removed then stays, hidden."""
+    """Create a folder beside an output until the stack is unwound; files that cannot be removed remain, hidden."""
     temporary = Path(tempfile.mkdtemp(prefix=_hidden(path), suffix=suffix, dir=folder))
     stack.callback(shutil.rmtree, temporary, ignore_errors=True)
     return temporary
@@ -244,15 +243,15 @@ def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = 
 
 @contextmanager
 def folder_written_whole(path: Path) -> Iterator[Path]:
-    """As `written_whole`, an output that is a folder: a temporary one beside it, which takes its place in the end.
+    """Do the same as `written_whole` for a folder: give a temporary folder, which replaces `path` at the end.
 
-    A folder that is there is moved aside for that; between the two moves, and if the process is killed there, its
-    name is free.
+    An existing folder is first moved aside. Between the two moves, also if the process is killed then, no folder has
+    the name.
 
     Raises
     ------
     TakenError
-        `checked_output` saw nothing there, and now there is something.
+        Something has appeared there since `checked_output`.
     OSError
         As `written_whole`.
     """
@@ -264,7 +263,7 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
         if not may_replace and os.path.lexists(place):
-            raise TakenError(f"{path}: another program has written it in the meantime, and without `force` it stays")
+            raise TakenError(f"{path}: another program has written it in the meantime; pass `force` to replace it")
         old = None
         if place.is_dir():
             old = _temporary_folder(stack, path, place.parent) / "old"
@@ -280,9 +279,9 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def telling(path: Path, n_bytes: int | None = None, folder: Path | None = None) -> Iterator[None]:
-    """Errors of the system as those of writing `path`, on a full disk with the number of bytes, if it is known.
+    """Report system errors as errors of writing `path`; on a full disk with the number of bytes, if known.
 
-    `folder` is where the file really lies, that of `path` by default.
+    `folder` is the real folder of the file, by default that of `path`.
     """
     try:
         yield
@@ -292,23 +291,23 @@ def telling(path: Path, n_bytes: int | None = None, folder: Path | None = None) 
 
 
 def save_bytes(path: str | Path, whole: bytes) -> None:
-    """Write a file, whole or not at all; errors as `written_whole`."""
+    """Write a file, whole or not at all; raises the errors of `written_whole`."""
     with written_whole(Path(path), len(whole)) as temporary:
         temporary.write_bytes(whole)
 
 
 def save_text(path: str | Path, text: str) -> None:
-    """Write text as UTF-8, whole or not at all; letters that are none, of names that are not UTF-8, as escapes."""
+    """Write text as UTF-8, whole or not at all; invalid characters, from names that are not UTF-8, are escaped."""
     save_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def save_json(path: Path, value: Any) -> None:
-    """Write `value` as JSON, whole or not at all; numpy numbers and arrays, NamedTuples and paths are taken."""
+    """Write `value` as JSON, whole or not at all; may contain numpy numbers and arrays, NamedTuples and paths."""
     save_text(path, json.dumps(_plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def kept_places(path: Path, suffix: str) -> Iterator[Path]:
-    """Free names where what `path` cannot take may be kept: beside it, then in temporary folders of one's own."""
+    """Yield free names for an output that cannot be written to `path`: beside it, then in new temporary folders."""
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
     places = (path.with_name(f"{name}{suffix}") for name in names)
     yield next(place for place in places if place != path and not os.path.lexists(place))
@@ -322,7 +321,7 @@ def _absolute(path: Path) -> Path:
 
 
 def _state(place: Path) -> os.stat_result | None:
-    """What is at a place, None for nothing."""
+    """Return the status of a place, None if nothing is there."""
     try:
         return os.lstat(place)
     except (FileNotFoundError, NotADirectoryError):
@@ -330,7 +329,7 @@ def _state(place: Path) -> os.stat_result | None:
 
 
 def _take_rights(temporary: Path, place: Path) -> None:
-    """Give the new file the rights and the group of the one that it replaces; a new one those that the umask leaves."""
+    """Give the new file the permissions and group of the file that it replaces, or those that the umask leaves."""
     before = _state(place)
     if before is None:
         mask = os.umask(0)
@@ -342,16 +341,16 @@ def _take_rights(temporary: Path, place: Path) -> None:
     if hasattr(os, "chown") and os.stat(temporary).st_gid != before.st_gid:
         try:
             os.chown(temporary, -1, before.st_gid)
-        except OSError:  # not one of our groups: the one that it has now may do what all others may
+        except OSError:  # not one of our groups: the present group gets the permissions of all others
             mode = (mode & ~0o070) | (mode & 0o007) << 3
     os.chmod(temporary, mode)
 
 
 def _on_disk(path: Path, place: Path | None = None) -> None:
-    """Have a file on the disk itself, with the rights of what is in its `place`.
+    """Synchronise a file to disk, with the permissions of the file in its `place`.
 
-    A power cut after the renaming would else leave an empty one. It is opened before it takes the rights, with which
-    nobody may perhaps write it.
+    Without this, a power cut after the renaming would leave an empty file. The file is opened before its permissions
+    change, as they may not allow writing.
     """
     handle = os.open(path, os.O_RDWR)
     try:
@@ -363,7 +362,7 @@ def _on_disk(path: Path, place: Path | None = None) -> None:
 
 
 def _synchronise_folder(folder: Path) -> None:
-    """Have the renaming on the disk, where folders can be synchronised."""
+    """Synchronise the renaming to disk, where folders can be synchronised."""
     if os.name == "nt":
         return
     try:
@@ -378,12 +377,12 @@ def _synchronise_folder(folder: Path) -> None:
 
 
 def _linked(temporary: Path, place: Path) -> bool:
-    """Give the file its name if that is free; whether it was."""
+    """Give the file its name if that is free; return whether it was."""
     try:
         os.link(temporary, place)
-    except FileExistsError:  # a network file system says so, too, where an answer was lost on the way
+    except FileExistsError:  # a network file system reports this, too, if an answer was lost
         return os.path.samefile(temporary, place)
-    except OSError:  # FAT and some network file systems have no links: the name is taken first, and then replaced
+    except OSError:  # FAT and some network file systems have no links: reserve the name first, then replace it
         try:
             os.close(os.open(place, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
         except FileExistsError:
@@ -397,24 +396,24 @@ def _linked(temporary: Path, place: Path) -> bool:
 
 
 def _beside(temporary: Path, path: Path) -> Path:
-    """Give the file a free name beside its own; the name."""
+    """Give the file a free name beside its own; return the name."""
     end = next((path.name[-len(each) :] for each in (".nii.gz",) if path.name.lower().endswith(each)), path.suffix)
     stem = path.name[: len(path.name) - len(end)]
     return next(kept for number in count(1) if _linked(temporary, kept := path.with_name(f"{stem}_kept_{number}{end}")))
 
 
 def _reason(error: OSError, folder: Path, n_bytes: int | None) -> str:
-    """Why a file cannot be written, on a full disk with the bytes that it takes."""
+    """Return why a file cannot be written; on a full disk with the bytes that it needs."""
     reason = f"cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) and n_bytes is not None:
-        reason += f"; it takes {n_bytes} bytes"
+        reason += f"; it needs {n_bytes} bytes"
         with suppress(OSError):
             reason += f", {shutil.disk_usage(folder).free} are free"
     return reason
 
 
 def _plain(value: Any) -> Any:
-    """`value` in JSON's own types; what is not finite becomes null, which JSON has no number for."""
+    """Convert `value` to JSON's own types; numbers that are not finite become null, as JSON cannot express them."""
     if hasattr(value, "_asdict"):
         return {key: _plain(item) for key, item in value._asdict().items()}
     if isinstance(value, dict):
@@ -428,5 +427,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     if isinstance(value, str | Path):
-        return str(value).encode("utf-8", "backslashreplace").decode()  # lone surrogates, of names, are not JSON
+        return str(value).encode("utf-8", "backslashreplace").decode()  # lone surrogates from names: no valid JSON
     return value

@@ -1,4 +1,4 @@
-"""What comes in stays data, and bounded: regular files only, texts and tables of a size that can be meant."""
+"""Safe reading of untrusted input: only regular files, and texts and tables of limited size."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from typing import Any
 
 from tetopt.errors import InputError
 
-TEXT_BYTES = 2**26  # 67 MB: the longest table of labels that is known, FreeSurfer's, has 0.1
-LARGEST_NUMBER = 1e300  # of a table: its square root is still far beyond anything measured, and its float is finite
-# What stands in a file's place and is none; a pipe that nobody writes to blocks for ever, /dev/zero never ends.
+TEXT_BYTES = 2**26  # 67 MB: the longest known label table, FreeSurfer's, has 0.1 MB
+LARGEST_NUMBER = 1e300  # in a table: a finite float whose square root is far beyond any measured value
+# Entries that are not regular files: a pipe without a writer blocks for ever, and /dev/zero never ends.
 KINDS_OF_FILES = {
     stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link",
 }  # fmt: skip
-# How tetopt opens its own files: not through a link, and without waiting at a pipe. Windows has neither flag.
+# Flags with which tetopt opens its own files: links are not followed, pipes do not block. Windows has neither flag.
 UNFOLLOWED = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def irregular(path: Path, *, follow: bool = True) -> str | None:
-    """What `path` is if it is there and no regular file: "a pipe", "a device", "a folder", unfollowed also "a link".
+    """Return the kind of an entry that is not a regular file: "a pipe", "a folder", without `follow` also "a link".
 
     Raises
     ------
     OSError
-        Nothing is there, or it may not be looked at.
+        The entry does not exist or is not accessible.
     """
     mode = path.stat(follow_symlinks=follow).st_mode
-    return None if stat.S_ISREG(mode) else KINDS_OF_FILES.get(stat.S_IFMT(mode), "no regular file")
+    return None if stat.S_ISREG(mode) else KINDS_OF_FILES.get(stat.S_IFMT(mode), "a special file")
 
 
 def regular_file(path: str | Path, noun: str) -> Path:
-    """`path`, where a file is to be read; asked before it is opened, as opening a pipe may block for ever.
+    """Return `path` if it is a regular file; call it before opening, because opening a pipe may block for ever.
 
     Parameters
     ----------
     path : str or Path
     noun : str
-        What is expected, as "mesh file".
+        The expected kind of file, e.g. "mesh file".
 
     Raises
     ------
     InputError
-        Nothing is there, it may not be looked at, or it is no regular file.
+        The file does not exist, is not accessible, or is not a regular file.
     """
     if not isinstance(path, str | Path):
         raise InputError(f"expected the path of a {noun}, got {type(path).__name__}")
@@ -57,27 +57,27 @@ def regular_file(path: str | Path, noun: str) -> Path:
         other = irregular(path)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file; expected a {noun}") from None
-    except (OSError, ValueError) as error:  # ValueError: a zero among the letters
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
         raise InputError(f"{path}: cannot be opened ({getattr(error, 'strerror', None) or error})") from error
     if other == "a folder":
-        raise InputError(f"{path}: no such file, it is a folder; expected a {noun}")
+        raise InputError(f"{path}: expected a {noun}, got a folder")
     if other is not None:
-        raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
+        raise InputError(f"{path}: expected a regular file, got {other}; copy its data into a file")
     return path
 
 
 def own_bytes(path: Path, most_bytes: int = TEXT_BYTES) -> bytes:
-    """The content of a file that tetopt wrote; links are not followed, as tetopt makes none.
+    """Return the content of a file that tetopt wrote; links are not followed, as tetopt creates none.
 
     Raises
     ------
     OSError
-        Nothing is there, or it cannot be read.
+        The file does not exist or cannot be read.
     InputError
-        A link, no regular file, or one of more bytes.
+        It is a link, is not a regular file, or has more than `most_bytes` bytes.
     """
     if (other := irregular(path, follow=False)) is not None:
-        raise InputError(f"{path}: expected a regular file, got {other}; replace it by the file itself, or remove it")
+        raise InputError(f"{path}: expected a regular file, got {other}; replace it with the file itself, or remove it")
     with open(os.open(path, os.O_RDONLY | UNFOLLOWED), "rb") as stream:
         whole = stream.read(most_bytes + 1)
     if len(whole) > most_bytes:
@@ -86,19 +86,19 @@ def own_bytes(path: Path, most_bytes: int = TEXT_BYTES) -> bytes:
 
 
 def text_of(path: str | Path, noun: str) -> str:
-    """The text of a file in UTF-8, with or without a mark at its beginning.
+    """Return the text of a UTF-8 file, with or without a byte-order mark.
 
     Raises
     ------
     InputError
-        As `regular_file`; it may not be read, is longer than `TEXT_BYTES`, or is not UTF-8.
+        For the reasons of `regular_file`; the file cannot be read, exceeds `TEXT_BYTES`, or is not UTF-8.
     """
     path = regular_file(path, noun)
     try:
         with path.open("rb") as stream:
             raw = stream.read(TEXT_BYTES + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read, {error.strerror}; expected a {noun}") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a {noun}") from error
     if len(raw) > TEXT_BYTES:
         raise InputError(f"{path}: expected a {noun} of at most {TEXT_BYTES / 1e6:.0f} MB, got {_size(path)}")
     try:
@@ -106,39 +106,39 @@ def text_of(path: str | Path, noun: str) -> str:
     except UnicodeDecodeError as error:
         advice = ', in Excel as "CSV UTF-8"' if path.suffix.lower() == ".csv" else ""
         raise InputError(
-            f"{path}: expected text in UTF-8, not at byte {error.start}; save the {noun} again{advice}"
+            f"{path}: expected UTF-8 text, got an invalid byte at {error.start}; save the {noun} again{advice}"
         ) from error
 
 
 def toml_of(path: str | Path, noun: str) -> dict[str, Any]:
-    """The table in a TOML file, of numbers that a float can be.
+    """Return the table in a TOML file, whose numbers must fit into a float.
 
     Raises
     ------
     InputError
-        As `text_of`; not TOML, nested too deeply, or with a number beyond `LARGEST_NUMBER`.
+        For the reasons of `text_of`; not TOML, nested too deeply, or a number beyond `LARGEST_NUMBER`.
     """
     text = text_of(path, noun)
     try:
         table = tomllib.loads(text)
         _check_numbers(table)
-    except ValueError as error:  # also int's, of more digits than it converts
-        raise InputError(f"{path}: expected TOML, got {_short(error)}; mend that place") from error
+    except ValueError as error:  # also raised by int for too many digits
+        raise InputError(f"{path}: expected TOML, got {_short(error)}; correct the file there") from error
     except RecursionError as error:
         raise InputError(f"{path}: expected TOML, got brackets nested too deeply") from error
     return table
 
 
 def rows_of(path: Path, noun: str, heads: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Names and what each has, of TOML's keys or of rows of CSV, between commas, semicolons or tabs.
+    """Return names and the values of each, from the keys of TOML or the rows of CSV.
 
-    In CSV the separator is the first of these that there is. Lines that are empty or begin with # are left out, and so
-    is a first row whose second cell is one of `heads`.
+    The separator of CSV is the first comma, semicolon or tab in the file. Empty lines and lines that begin with # are
+    skipped, and so is a first row whose second cell is one of `heads`.
 
     Raises
     ------
     InputError
-        As `toml_of` or `text_of`; a row of one cell alone.
+        For the reasons of `toml_of` or `text_of`; a row has only one cell.
     """
     if path.suffix.lower() == ".toml":
         table = toml_of(path, noun)
@@ -153,17 +153,17 @@ def rows_of(path: Path, noun: str, heads: Sequence[str]) -> list[tuple[str, list
     if rows and rows[0][1:] and rows[0][1].lower() in heads:
         del rows[0]
     if short := [row for row in rows if not "".join(row[1:])]:
-        raise InputError(f'{path}: expected rows of a name and what it has, got "{separator.join(short[0])[:80]}"')
+        raise InputError(f'{path}: expected rows of a name and values, got "{separator.join(short[0])[:80]}"')
     return [(row[0], [cell for cell in row[1:] if cell]) for row in rows]
 
 
 def json_of(text: str) -> Any:
-    """What a text in JSON stands for, of numbers that a float can be.
+    """Parse a JSON text, whose numbers must fit into a float.
 
     Raises
     ------
     ValueError
-        Not JSON, nested too deeply, or with a number beyond `LARGEST_NUMBER`.
+        Not JSON, nested too deeply, or a number beyond `LARGEST_NUMBER`.
     """
     try:
         value = json.loads(text)

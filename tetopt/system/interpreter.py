@@ -1,7 +1,7 @@
-"""Other processes of Python, by which kernels are compiled, files read, pipelines run and tasks worked on.
+"""Other Python processes, which compile kernels, read files, run pipelines and work on tasks.
 
-None of them imports modules of the current folder, which may be as untrusted as its files: neither those that
-are started here, nor what they start, nor those of libraries.
+None of them imports modules from the current folder, which may be as untrusted as its files. This holds for
+processes started here, for those that they start, and for those of libraries.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Numba's, read as it is loaded. Not those of BLAS, which dask leaves one: its rounding depends on them.
+# Numba reads this variable when it is imported. Those of BLAS, which dask sets to one, stay: its rounding depends on
+# the number of threads.
 THREADS_NAME = "NUMBA_NUM_THREADS"
-SAFE_PATH_NAME = "PYTHONSAFEPATH"  # python -P, also of whatever a process starts
+SAFE_PATH_NAME = "PYTHONSAFEPATH"  # the same as python -P, inherited by all processes that a process starts
 
 
 def python_command(*words: str) -> list[str]:
@@ -22,18 +23,18 @@ def python_command(*words: str) -> list[str]:
 
 
 def python_environment(**names: str) -> dict[str, str]:
-    """Return the environment of such a process, which imports from where this one does, with `names` added."""
+    """Return the environment of such a process, which imports from the same folders as this one; adds `names`."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), SAFE_PATH_NAME: "1"} | names
 
 
 def others_environment() -> dict[str, str]:
-    """Return the environment of a program of the user's, which may be Python and import what lies beside it."""
+    """Return the environment of a user's program, which may be in Python and import modules beside itself."""
     return {name: value for name, value in os.environ.items() if name != SAFE_PATH_NAME}
 
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Keep processes of Python that libraries start within the block from importing modules of the current folder."""
+    """Keep Python processes that libraries start within the block from importing modules of the current folder."""
     before = os.environ.get(SAFE_PATH_NAME)
     os.environ[SAFE_PATH_NAME] = "1"
     try:

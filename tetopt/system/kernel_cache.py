@@ -1,12 +1,12 @@
-"""numba's cache of compiled functions, of which nothing that goes wrong ends a run.
+"""numba's cache of compiled functions, whose failures never end a run.
 
-What is read has to have the checksum that was written with it, or else it is compiled again: code that a damaged file
-holds would end the process. A file that somebody else can have written is not read either: pickles run code. What
-cannot be written, on a full disk or in a folder that is gone, is not kept. Each of these is said once, on one line, by
-a `RuntimeWarning`.
+A file is read only if it has the checksum that was written with it; otherwise the function is compiled again, as code
+from a damaged file would crash the process. A file that another user could have written is not read either: pickles
+run code. Code that cannot be written, because the disk is full or the folder is gone, is not kept. In each of these
+cases a one-line `RuntimeWarning` is issued once.
 
-That rests on the inside of numba. Where it lacks a name, or on request (`IS_PLAIN`), functions are compiled and kept
-by what numba's documents have alone, in a folder that only this user can open.
+This relies on internals of numba. Where numba lacks a name, or on request (`IS_PLAIN`), functions are compiled and
+kept only with numba's documented features, in a folder that only this user can open.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numba
 try:
     from numba.core.caching import FunctionCache, IndexDataCacheFile
     from numba.core.options import DefaultOptions
-except ImportError:  # by `MISSING` below
+except ImportError:  # reported by `MISSING` below
     FunctionCache = IndexDataCacheFile = DefaultOptions = object
 
 from tetopt.system.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
@@ -41,15 +41,15 @@ INSIDE = (
     (numba.njit(lambda: None), ("_cache",)),
 )
 MISSING = sorted(name for owner, names in INSIDE for name in names if not hasattr(owner, name))
-# Whether functions are compiled with what numba's documents have, and nothing else.
+# True if functions are compiled with documented features of numba only.
 IS_PLAIN = bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
 PLAIN_NOTICE = f"kernels take longer to compile: tetopt cannot use the internals of numba {numba.__version__} ({{}})"
-NOT_KEPT = "compiled kernels cannot be kept, so that later runs compile them again: {}"
+NOT_KEPT = "compiled kernels cannot be kept, so later runs compile them again: {}"
 
 
 @cache
 def checksum() -> str:
-    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
+    """Return the checksum of the sources of all kernels and their constants; code of other sources is not reused."""
     folder, total = Path(__file__).parents[1], 0
     patterns = [
         "system/kernel*.py",
@@ -61,24 +61,24 @@ def checksum() -> str:
 
 
 class NotKeptWarning(RuntimeWarning):
-    """What was compiled cannot be written for later runs."""
+    """Compiled code cannot be written for later runs."""
 
 
 @cache  # once each
 def warn(notice: str, kind: type[RuntimeWarning] = RuntimeWarning) -> None:
-    """Warn of what went wrong with the cache, once in a process."""
+    """Warn of a failure of the cache, once per process."""
     warnings.warn(notice, kind, stacklevel=3)
 
 
 class DamagedFileError(Exception):
-    """A file of the cache is not what was written, or not by whom."""
+    """A file of the cache is damaged, or is not trusted."""
 
 
 class SealedFile(IndexDataCacheFile):
-    """numba's index of a function's compilations and its files of code, each with version and checksum ahead.
+    """numba's index of a function's compilations and its code files, each preceded by version and checksum.
 
-    A file of code holds its key, too: two processes that write at once may give the same name to different code.
-    What it lacks is looked for in `shipped`.
+    A code file also holds its key, because two processes that write at once may give the same name to different code.
+    Missing code is looked up in `shipped`.
     """
 
     def __init__(self, folder: str, name: str, stamp: Any, shipped: SealedFile | None = None) -> None:
@@ -86,11 +86,11 @@ class SealedFile(IndexDataCacheFile):
         self._shipped = shipped
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep what was compiled for a key."""
+        """Keep the code compiled for a key."""
         super().save(key, (key, data))
 
     def load(self, key: Any) -> Any:
-        """What was compiled for a key, or None."""
+        """Return the code compiled for a key, or None."""
         pair = super().load(key)
         if pair is not None and pair[0] == key:
             return pair[1]
@@ -117,61 +117,61 @@ class SealedFile(IndexDataCacheFile):
 
     def _seal(self, path: str, data: Any) -> None:
         content = self._dump(data)
-        if (words := untrusted(os.lstat(self._cache_path))) is not None:  # it would not be read
+        if (words := untrusted(os.lstat(self._cache_path))) is not None:  # the file would not be read
             raise PermissionError(f"{self._cache_path} {words}")
         with self._open_for_write(path) as file:
             os.chmod(file.name, FILE_MODE)
             file.write(b"%s %08x\n" % (self._version.encode(), zlib.crc32(content)) + content)
 
     def _unsealed(self, path: str) -> Any:
-        """What a file holds; `DamagedFileError`, of which the user is told, if that is not what was written."""
+        """Return the content of a file; warn and raise `DamagedFileError` if it is damaged."""
         head, _, content = self._trusted_bytes(path).partition(b"\n")
         version, _, checksum = head.partition(b" ")
         if version == self._version.encode() and checksum == b"%08x" % zlib.crc32(content):
             return pickle.loads(content)
         if not checksum or version == self._version.encode():
-            warn(f"damaged files in the cache of kernels, {self._cache_path}: what they held is compiled again")
+            warn(f"recompiling kernels: the cache {self._cache_path} has damaged files")
         raise DamagedFileError(path)
 
     def _trusted_bytes(self, path: str) -> bytes:
-        """The bytes of a file; `DamagedFileError`, of which the user is told, if somebody else can have written it."""
+        """Return the bytes of a file; warn and raise `DamagedFileError` if another user could have written it."""
         for name in (path, self._cache_path):
             if (words := untrusted(os.lstat(name))) is not None:
                 warn(
-                    f"kernels in {self._cache_path} are not loaded but compiled again, as somebody else can have "
-                    f"written them: {Path(name).name} {words}; remove that folder"
+                    f"recompiling kernels: another user could have written those in {self._cache_path} "
+                    f"({Path(name).name} {words}); remove that folder"
                 )
                 raise DamagedFileError(path)
         return Path(path).read_bytes()
 
 
 class SealedCache(FunctionCache):
-    """numba's cache of a function, which gives up where it cannot read or write."""
+    """numba's cache of a function, which does without files that it cannot read or write."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        # Indices are checked, or not, by the code itself, of which numba's keys know nothing.
+        # Bounds checks are part of the compiled code, but not of numba's keys.
         kind = "-sb" if numba.config.BOUNDSCHECK else "-s"
         name, stamp = self._impl.filename_base + kind, self._impl.locator.get_source_stamp()
-        # Whoever installed the package may have compiled them, for all users or for a container that only reads.
+        # Kernels compiled when the package was installed, for all users or for a read-only container.
         shipped = SealedFile(str(Path(inspect.getfile(function)).parent / "__pycache__"), name, stamp)
         self._cache_file: Any = SealedFile(self._cache_path, name, stamp, shipped)
         with contextlib.suppress(OSError), os.scandir(self._cache_path) as entries:
-            if not any(entries):  # numba has just made it, as the user's mask has it
+            if not any(entries):  # numba has just created it, with the user's umask
                 os.chmod(self._cache_path, FOLDER_MODE)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What was compiled for a signature, or None."""
+        """Return the code compiled for a signature, or None."""
         try:
             return super().load_overload(sig, target_context)
-        except OSError:  # if it can be written, all is well from then on, else that is said
+        except OSError:  # writing either repairs this or issues a warning
             return None
-        except (AttributeError, ImportError, TypeError) as error:  # of classes that there are no more
-            warn(f"the cache of kernels cannot be read, they are compiled anew: {error}")
+        except (AttributeError, ImportError, TypeError) as error:  # from classes that no longer exist
+            warn(f"recompiling kernels: their cache cannot be read: {error}")
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep what was compiled for a signature, if that can be."""
+        """Keep the code compiled for a signature, if possible."""
         try:
             super().save_overload(sig, data)
         except (AttributeError, OSError, TypeError) as error:
@@ -179,19 +179,19 @@ class SealedCache(FunctionCache):
 
 
 def cache_of(function: Callable[..., Any]) -> Any:
-    """The cache of a function that numba compiles; None where there is no folder for it."""
+    """Return the cache of a function that numba compiles; None if there is no folder for it."""
     if place_cache().folder is not None:
         try:
             return SealedCache(function)
-        except RuntimeError:  # no locator: the folder has gone, or takes no more files
-            warn("kernels are compiled anew: the folder of their cache can no longer be written", NotKeptWarning)
+        except RuntimeError:  # no locator: the folder is gone or no longer writable
+            warn("recompiling kernels: the folder of their cache is no longer writable", NotKeptWarning)
         except (AttributeError, TypeError) as error:
             warn(NOT_KEPT.format(error), NotKeptWarning)
     return None
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate as `numba.njit` does; `cache=True` stands for this cache."""
+    """Decorate as `numba.njit` does; `cache=True` uses this cache."""
     if IS_PLAIN:
         return plain_njit(**options)
     is_kept = options.pop("cache", False)
@@ -206,18 +206,18 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate as `numba.njit` does, without the options that its documents do not have; `cache=True` is its cache."""
+    """Decorate as `numba.njit` does, without undocumented options; `cache=True` uses numba's own cache."""
     known = {name: value for name, value in options.items() if name not in INSIDE_OPTIONS}
     return numba.njit(*signature, **known | {"cache": known.get("cache", False) and has_own_folder()})
 
 
 @cache
 def has_own_folder() -> bool:
-    """Point numba's own cache, which trusts what it reads, to a folder that only this user can open, if that can be."""
+    """Point numba's own cache, which trusts its files, to a folder that only this user can open, if possible."""
     place = place_cache().folder
     if place is None or numba.config.DISABLE_JIT:
         return False
-    # Its keys know neither the code of other files nor whether indices are checked.
+    # Its keys include neither the code of other files nor bounds checks.
     folder = place / f"plain-{checksum()}{'-checked' * bool(numba.config.BOUNDSCHECK)}"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)

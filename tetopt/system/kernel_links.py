@@ -1,6 +1,6 @@
-"""The inside of numba that kernels use: records passed by address, units called through the linker's symbols.
+"""The internals of numba that kernels use: records passed by address, units called through linker symbols.
 
-What is imported here may be gone in any version of numba. `tetopt.system.kernels` then does without this module.
+Any version of numba may drop what this module imports. `tetopt.system.kernels` then does without it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from numba.np.arrayobj import populate_array
 from tetopt.system.kernel_cache import checksum, njit
 from tetopt.system.kernel_types import check_array, numpy_dtype, type_of
 
-WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
+WORD_BYTES = 8  # size of a number, an address or a length in a record's memory
 
 
 class RecordType(types.Type):
-    """What numba knows of a NamedTuple whose address it gets."""
+    """numba's type of a NamedTuple that is passed by address."""
 
     def __init__(self, record: type) -> None:
         self.record = record
@@ -45,7 +45,7 @@ class RecordType(types.Type):
         super().__init__(f"{record.__module__}.{record.__qualname__}-{checksum()}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """In the keys of numba's cache, by name: the record of another version may be gone."""
+        """Pickle by name for the keys of numba's cache: the record of another version may no longer exist."""
         return _type_of_name, (self.record.__module__, self.record.__qualname__, checksum())
 
 
@@ -57,7 +57,7 @@ def _type_of_name(module: str, name: str, version: str) -> types.Type:
 
 @cache
 def record_type(record: Any) -> RecordType:
-    """The one type of a NamedTuple."""
+    """Return the unique type of a NamedTuple."""
     return RecordType(record)
 
 
@@ -66,7 +66,7 @@ register_model(RecordType)(OpaqueModel)
 
 @intrinsic
 def nth(_context: Any, records: Any, number: Any) -> Any:
-    """The record of that number in a list of them, of which kernels have the address of the first."""
+    """Return the record with a number from a list of records, given the address of the first."""
 
     def generate(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         step = ir.Constant(ir.IntType(64), WORD_BYTES * signature.return_type.n_words)
@@ -85,7 +85,7 @@ class _RecordFields(AttributeTemplate):
 
 @lower_getattr_generic(RecordType)
 def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name: str) -> Any:
-    """A field of a record. Its memory never changes while kernels run, which LLVM is told: loads leave the loops."""
+    """Load a field of a record. LLVM learns that its memory is constant while kernels run, and hoists loads."""
     field, first = record.fields[name], record.offsets[name]
     words = builder.bitcast(value, ir.IntType(64).as_pointer())
     constant = builder.module.add_metadata([])
@@ -108,7 +108,7 @@ def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name
 
 
 class Packed:
-    """A record laid out in memory, of which kernels get the address. It keeps what it points to."""
+    """A record laid out in memory for kernels, which get its address. It keeps alive everything it points to."""
 
     __slots__ = ("address", "kept", "type", "words")
 
@@ -120,7 +120,7 @@ class Packed:
         self.address = self.words.ctypes.data
 
     def _put(self, value: Any, name: str) -> Any:
-        """Lay out one field; what has to be kept for it besides the record itself."""
+        """Lay out one field; return the objects to keep alive for it in addition to the record."""
         field, first = self.type.fields[name], self.type.offsets[name]
         if isinstance(field, types.Array):
             check_array(value, field, f"{self.type.record.__name__}.{name}")
@@ -146,7 +146,7 @@ class Packed:
         return None
 
     def _check(self, inner: Any, name: str) -> None:
-        """TypeError unless a field gets the record that it is for: kernels would read another one's memory."""
+        """Raise TypeError unless a field gets a record of its type: kernels would misread another record's memory."""
         if getattr(inner, "type", None) != self.type.fields[name]:
             raise TypeError(f"{self.type.record.__name__}.{name}: expected {self.type.fields[name]}, got {inner!r}")
 
@@ -166,7 +166,7 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
 
 @intrinsic
 def fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
-    """Call the task at an address, with that of a record and a number: whether it raised an error."""
+    """Call the task at an address with the address of a record and a number; return whether it raised an error."""
 
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         convention, kinds = context.call_conv, (types.voidptr, types.int64)
@@ -178,10 +178,10 @@ def fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
     return types.boolean(types.int64, types.int64, types.int64), generate
 
 
-# The one parallel loop: each loop of its own took 2 s to compile.
+# The only parallel loop: separate loops took 2 s each to compile.
 @njit(cache=True, parallel=True)
 def run(task: int, values: int, n: int) -> int:
-    """Call the task at an address for a record and all numbers up to n: how many calls fail."""
+    """Call the task at an address for a record and all numbers below n; return how many calls fail."""
     n_failed = 0
     for number in prange(n):
         n_failed += fails(task, values, np.int64(number))
@@ -189,7 +189,7 @@ def run(task: int, values: int, n: int) -> int:
 
 
 def function_type(symbol: str, function: Callable[..., Any], of_call: types.Type) -> types.Function:
-    """How kernels call a function by its symbol: to numba an operation of its own, which raises what that raises."""
+    """Return the numba type that calls a function by its symbol and raises the errors that the function raises."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         convention = context.call_conv
@@ -210,13 +210,13 @@ def function_type(symbol: str, function: Callable[..., Any], of_call: types.Type
 
 
 def address_of(dispatcher: Any) -> int:
-    """Where the code of a function of one signature is in memory."""
+    """Return the address of the code of a function with one signature."""
     (result,) = dispatcher.overloads.values()
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
 
 def add_symbol(symbol: str, address: int) -> None:
-    """Let the linker know a symbol; RuntimeError if it does not: to link with it would end the process."""
+    """Add a symbol to the linker; RuntimeError if that fails, because using the symbol would end the process."""
     llvm.add_symbol(symbol, address)
     if llvm.address_of_symbol(symbol) != address:
         raise RuntimeError(f"the linker has no symbol {symbol}")

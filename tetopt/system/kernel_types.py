@@ -1,4 +1,4 @@
-"""Types of what kernels take, from annotations: arrays, numbers, tuples of these, and records (NamedTuples of all)."""
+"""Types of the arguments of kernels, from annotations: arrays, numbers, tuples and records (NamedTuples of these)."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ def type_of(hint: Any, of_record: Callable[[Any], types.Type]) -> types.Type:
 
 
 def by_value(record: type) -> types.BaseTuple:
-    """numba's own type of a NamedTuple, which kernels make and pass on in all its numbers."""
+    """Return numba's own type of a NamedTuple, which kernels pass by value."""
     hints = typing.get_type_hints(record, include_extras=True)
     return types.BaseTuple.from_types([type_of(hint, by_value) for hint in hints.values()], record)
 
 
 def numpy_dtype(array: types.Array) -> np.dtype[Any]:
-    """The dtype of numpy of one of numba's types of arrays."""
+    """Return the numpy dtype of a numba array type."""
     return np.dtype(np.bool_ if array.dtype == types.boolean else array.dtype.name)
 
 
 def check_array(value: Any, kind: types.Array, name: str) -> None:
-    """TypeError unless an array is of the type that a field is annotated with."""
+    """Raise TypeError unless an array has the annotated type of a field."""
     if not (value.flags.c_contiguous and value.ndim == kind.ndim and value.dtype == numpy_dtype(kind)):
         raise TypeError(f"{name}: expected {kind}, got {numba.typeof(value)}")
 
 
 def cast(value: Any, kind: types.Type, name: str, number: int = 0) -> Any:
-    """Cast a record, or a field of one, to its annotated type for numba by value; of a list, the record of `number`."""
+    """Cast a record or a field to its annotated type, for numba by value; a list gives its record with `number`."""
     if isinstance(value, list):
         value = value[number]
     if isinstance(kind, types.BaseTuple):
@@ -59,7 +59,7 @@ def cast(value: Any, kind: types.Type, name: str, number: int = 0) -> Any:
 
 
 class _Unlocked:
-    """A read-only array as numba's type of one that can be written, so that kernels are compiled once."""
+    """A read-only array that numba sees as writable, so that kernels are compiled only once."""
 
     def __init__(self, array: NDArray[Any]) -> None:
         self.source = array

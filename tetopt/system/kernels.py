@@ -1,16 +1,16 @@
-"""Compiled kernels: each is compiled once, apart from the others, and records go to them by address.
+"""Compiled kernels: each is compiled once, separately, and receives records by address.
 
-numba compiles a function again inside of every function that calls it, and passes a record of thirty arrays as three
-hundred numbers. Here a *unit* is compiled on its own, with a signature from its annotations, and called through the
-linker's symbol, as a function of another file is in C; a *record* (a NamedTuple of arrays, numbers and records) is a
-block of memory whose address is passed. Helpers are plain numba functions that go into the units that use them;
-*entries* are what Python calls; and a parallel loop is a unit run for each number of a range (`run`).
+numba recompiles a function inside every function that calls it, and passes a record of thirty arrays as three hundred
+numbers. Here a *unit* is compiled on its own, with a signature from its annotations, and is called through a linker
+symbol, as C calls a function in another file; a *record* (a NamedTuple of arrays, numbers and records) is a block of
+memory that is passed by address. *Helpers* are plain numba functions that are compiled into the units that use them;
+Python calls *entries*; and a parallel loop runs a unit for each number of a range (`run`).
 
-Symbols and addresses are the inside of numba (`tetopt.system.kernel_links`). Where that fails its test below, or on
-request, kernels are plain functions of numba's, of the same signatures, that take records by value: slower, the same
-bits.
+Symbols and addresses use internals of numba (`tetopt.system.kernel_links`). If these fail the test below, or on
+request, kernels are plain numba functions with the same signatures that take records by value: slower, with identical
+results.
 
-docs/develop/kernels.md tells what each of these bought.
+docs/develop/kernels.md gives the gain of each of these.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from tetopt.system.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, c
 from tetopt.system.kernel_types import by_value, cast, type_of
 from tetopt.system.lock import lock_file
 
-# Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
+# Arrays in the signatures of units and in records, by number of axes; the last axis is contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
 Floats2 = Annotated[NDArray[np.float64], types.float64[:, ::1]]
 Floats3 = Annotated[NDArray[np.float64], types.float64[:, :, ::1]]
@@ -62,21 +62,21 @@ Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
 Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
-UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
-# In the cache's folder, of all runs of this package: those of another one compile other files.
+UNIT_BYTES = 1 << 25  # for all arrays that units allocate at a time: a few KB each on each thread
+# In the cache's folder, shared by all runs of this installation: other installations compile other files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parents[1]).encode()):08x}.lock"
-PIECES_PER_THREAD = 8  # of a plain loop: some take longer than others
-POLLED_SECONDS = 0.1  # between looks at processes that compile
-LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
-MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
+PIECES_PER_THREAD = 8  # pieces of a plain loop, as some take longer than others
+POLLED_SECONDS = 0.1  # between polls of compiling processes
+LONGEST_WAIT_SECONDS = 600.0  # for another run to compile: all kernels take 145 s on a busy machine
+MOST_COMPILING = 4  # processes at most: each imports numba first, 1 s and 200 MB
 
 
-_LINKING = threading.RLock()  # of Python's threads one links at a time: the first's code is what others call
-_links: list[Any] = []  # what `links` returns, once it is known
+_LINKING = threading.RLock()  # one Python thread links at a time, and the others call its code
+_links: list[Any] = []  # the result of `links`, once it is known
 
 
 def links() -> Any:
-    """Return `kernel_links` if it works, which is tested once; else None: kernels are plain `numba.njit`."""
+    """Return `kernel_links` if it passes its test, which runs once; otherwise None, and kernels are plain numba."""
     with _LINKING:
         if not _links:
             _links.append(None)
@@ -84,35 +84,35 @@ def links() -> Any:
                 try:
                     _links[0] = import_module("tetopt.system.kernel_links")
                     check_links()
-                except Exception as error:  # of any kind: what is imported may be gone, or do something else
+                except Exception as error:  # any kind: numba's internals may be gone, or behave differently
                     _links[0] = None
                     warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
     return _links[0]
 
 
 def packed(value: Any) -> Any:
-    """A record laid out for kernels; anything else as it is, one that is laid out already among it."""
+    """Lay out a record for kernels; return any other value, including a laid-out record, unchanged."""
     if numba.config.DISABLE_JIT or not (isinstance(value, tuple) and hasattr(value, "_fields")):
         return value
     return cast(value, by_value(type(value)), "argument") if links() is None else links().Packed(value)
 
 
-ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
-_LOOPING = threading.Lock()  # held by the one that runs a loop, where numba's threads can serve only one
+ALL_KERNELS: list[Any] = []  # all kernels of the modules imported so far
+_LOOPING = threading.Lock()  # held while a loop runs, where numba's threads can serve only one
 
 
 ALLOCATING_NAMES = frozenset(("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy"))
 
 
 def _named(function: Any) -> list[Any]:
-    """The global values that a function names."""
+    """Return the global values that a function names."""
     return [function.__globals__.get(name) for name in function.__code__.co_names]
 
 
 def _counts(function: Callable[..., Any]) -> bool:
-    """Whether numba has to count references to arrays in a function: it makes some, or gets some from a helper.
+    """Return whether numba must count references to arrays in a function: it creates some, or a helper returns some.
 
-    Counting is atomic, up and down at every call, and was a third of a sweep and half of a pass of flips.
+    Counting is atomic and happens twice per call; it took a third of a sweep and half of a pass of flips.
     """
     if ALLOCATING_NAMES.intersection(function.__code__.co_names):
         return True
@@ -126,10 +126,10 @@ def _returns_arrays(function: Callable[..., Any]) -> bool:
 
 
 def _versioned(function: Callable[..., Any], **values: Any) -> Callable[..., Any]:
-    """A function for numba to compile that closes over the checksum of all kernels, with global values of its own.
+    """Return a copy of a function that closes over the checksum of all kernels, with its own global values.
 
-    numba's cache is keyed by the code of one function and what that closes over, so that it would return a function
-    compiled with others as they were before.
+    numba's cache is keyed by the code and closure of a single function, so it would otherwise return a function that
+    was compiled with older versions of others.
     """
     code = function.__code__.replace(co_freevars=("checksum",))
     version = FunctionType(code, function.__globals__ | values, function.__name__, None, (CellType(checksum()),))
@@ -138,7 +138,7 @@ def _versioned(function: Callable[..., Any], **values: Any) -> Callable[..., Any
 
 
 class Kernel:
-    """A function that numba compiles, with a signature from its annotations."""
+    """A function that numba compiles with a signature from its annotations."""
 
     type: types.Type  # how other kernels call it
 
@@ -151,68 +151,68 @@ class Kernel:
 
     @cached_property
     def signature(self) -> Any:
-        """numba's, of the annotations."""
+        """The signature for numba, from the annotations."""
         hints = typing.get_type_hints(self.function, include_extras=True)
         of_record = by_value if links() is None else links().record_type
         result = type_of(hints.pop("return"), of_record)
         return result(*(type_of(hint, of_record) for hint in hints.values()))
 
     def link(self) -> None:
-        """Make its symbol known, and those of what it calls before."""
+        """Add its symbol to the linker, after those of the units that it calls."""
         if self.is_linked:
             return
         with _LINKING:
-            numba.get_num_threads()  # the threads' own functions are known to the linker from then on
+            numba.get_num_threads()  # adds the threads' own functions to the linker
             for unit in units_of(self.function):
                 unit.link()
             self._make_known()
             self.is_linked = True
 
     def _make_known(self) -> None:
-        """Let the linker know its own symbol; an entry has none."""
+        """Add its own symbol to the linker; an entry has none."""
 
     @cached_property
     def dispatcher(self) -> Any:
-        """How Python calls it: numba's."""
-        compiled_by = plain_njit if links() is None else njit  # their caches are apart: only one has symbols
+        """The numba dispatcher by which Python calls it."""
+        compiled_by = plain_njit if links() is None else njit  # with separate caches: only one has symbols
         return compiled_by(cache=True, error_model="numpy")(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
-        """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
+        """Call it from Python: links the units that it calls, and lays out records."""
         self.link()
         _check_room()
         return self.dispatcher(*map(packed, values))
 
     @cached_property
     def compiled(self) -> Any:
-        """The dispatcher whose code other kernels or Python call; compiled now, or taken from the cache."""
+        """The dispatcher whose code other kernels or Python call, compiled now or loaded from the cache."""
         self.dispatcher.compile(self.signature.args)
         return self.dispatcher
 
     @property
     def was_cached(self) -> bool:
-        """Whether it was compiled before this process."""
+        """True if it was compiled before this process started."""
         return bool(sum(self.compiled.stats.cache_hits.values()) > 0)
 
 
 class Unit(Kernel):
-    """A function compiled on its own, called by other kernels through its symbol. Called from Python it is an entry."""
+    """A function compiled on its own, which other kernels call through its symbol. From Python it acts as an entry."""
 
     @cached_property
     def symbol(self) -> str:
-        """Its name for the linker."""
+        """The name of its linker symbol."""
         return f"{self.__module__}.{self.__name__}.{checksum()}"
 
     @cached_property
     def type(self) -> types.Type:
-        """How other kernels call it."""
+        """The numba type by which other kernels call it."""
         if links() is None:
             return types.Dispatcher(self.compiled)
         return links().function_type(self.symbol, self.function, self.signature)
 
     @cached_property
     def compiled(self) -> Any:
-        """The same for callers of machine code only."""
+        """The dispatcher for callers in machine code only."""
         if links() is None:
             options = {"cache": True, "error_model": "numpy", "nogil": True}
             return plain_njit(self.signature, **options)(_versioned(self.function))
@@ -222,12 +222,12 @@ class Unit(Kernel):
 
     @cached_property
     def address(self) -> int:
-        """Where it is in memory."""
+        """The address of its code."""
         return links().address_of(self.compiled)
 
     @cached_property
     def loop(self) -> Any:
-        """A plain function that calls it for a record and the numbers from one up to another: how many calls fail."""
+        """A plain function that calls it for a record and a range of numbers, and returns how many calls fail."""
         version = _versioned(_loop, _task=self)
         version.__qualname__ = f"_loop.{self.symbol}"
         signature = types.int64(self.signature.args[0], types.int64, types.int64)
@@ -245,7 +245,7 @@ class Entry(Kernel):
 
     @cached_property
     def type(self) -> types.Type:
-        """How other kernels call it."""
+        """The numba type by which other kernels call it."""
         return types.Dispatcher(self.dispatcher)
 
 
@@ -256,13 +256,13 @@ def _typeof_kernel(kernel: Kernel, _context: Any) -> types.Type:
 
 
 def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
-    """The units that a function calls, itself or by helpers that go into it."""
+    """Yield the units that a function calls, directly or through its helpers."""
     for part in _parts(function):
         yield from (value for value in _named(part) if isinstance(value, Unit))
 
 
 def _parts(function: Callable[..., Any]) -> list[Any]:
-    """A function and the helpers that go into it."""
+    """Return a function and the helpers that are compiled into it."""
     parts: list[Any] = [function]
     for part in parts:
         for value in _named(part):
@@ -275,19 +275,19 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
 
 
 def _check_room() -> None:
-    """MemoryError where a limit leaves too little for the arrays that units make, which are all small."""
+    """Raise MemoryError if a limit leaves too little for the arrays that units allocate, all of which are small."""
     room = address_room()
     if room is not None and room < UNIT_BYTES:
         raise MemoryError(f"{room} bytes are left for kernels, which need {UNIT_BYTES}")
 
 
-# Compiling in several processes.
+# Compilation in several processes.
 
 
 def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) -> None:
-    """Link kernels and all that they call; what the cache does not hold is compiled in several processes.
+    """Link kernels and the units that they call; compile those missing from the cache in several processes.
 
-    `progress` is called now and then with what is going on in words, if anything has to be compiled.
+    `progress` is called with progress messages if anything has to be compiled.
     """
     if numba.config.DISABLE_JIT:
         return
@@ -311,7 +311,7 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
 
 
 def _n_kept(order: Sequence[Any], first: int) -> int:
-    """How many kernels from the first on need no compiling, up to the next that does, which is compiled by this."""
+    """Return the number of kernels before the next uncached one, starting at `first`; compiles that one."""
     for number, kernel in enumerate(order[first:], start=first):
         kernel.link()
         if not kernel.was_cached:
@@ -321,11 +321,11 @@ def _n_kept(order: Sequence[Any], first: int) -> int:
 
 @contextlib.contextmanager
 def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
-    """Whether another run was compiling into this folder, for whose end this waits: not everything is done twice."""
+    """Wait until no other run compiles into this folder, to avoid double work; give whether one did."""
     has_waited = False
     try:
         lock = (folder / LOCK_NAME).open("ab")
-    except OSError:  # then both compile
+    except OSError:  # then both runs compile
         yield False
         return
     with lock:
@@ -339,7 +339,7 @@ def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
 
 
 def roots() -> list[Kernel]:
-    """The kernels that no other calls: those of all modules imported so far."""
+    """Return the kernels that no other kernel calls, among all modules imported so far."""
     called = {inner for kernel in ALL_KERNELS for inner in units_of(kernel.function)}
     return [kernel for kernel in ALL_KERNELS if kernel not in called]
 
@@ -351,7 +351,7 @@ def _callees_first(kernel: Any) -> Iterator[Any]:
 
 
 def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], None]) -> None:
-    """Compile kernels into the cache in as many processes as there are cores, up to `MOST_COMPILING`."""
+    """Compile kernels into the cache, in one process per core and at most `MOST_COMPILING`."""
     n_processes = min(MOST_COMPILING, os.cpu_count() or 1)
     if n_processes < 2 or not kernels or not sys.executable:
         return
@@ -362,9 +362,9 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
     with contextlib.ExitStack() as stack:
         try:
             claims = stack.enter_context(tempfile.TemporaryDirectory(prefix="tetopt-", dir=folder))
-        except OSError:  # what cannot be shared is compiled by the caller
+        except OSError:  # then the caller compiles everything
             return
-        # Ctrl-C is for this process, which then ends the others.
+        # Only this process reacts to Ctrl-C, and then ends the others.
         code = (
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
             f"from tetopt.system.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
@@ -377,10 +377,10 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
 
 
 def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
-    """Compile kernels, `module:name` each, into numba's cache, unless another process has claimed them.
+    """Compile kernels, given as `module:name`, into numba's cache unless another process has claimed them.
 
-    They know only the names of what they call, so that none may be called in this process. It ends when `parent` has,
-    or when nothing can be kept for that; the user is told by `parent`, which meets what is left.
+    The symbols that they call are placeholders here, so none may be called in this process. It ends when `parent`
+    ends, or when code cannot be kept; `parent` then compiles the rest and warns the user.
     """
     warnings.simplefilter("ignore")
     warnings.simplefilter("error", NotKeptWarning)
@@ -390,7 +390,7 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
         if isinstance(kernel, Unit):
             links().add_symbol(kernel.symbol, 1)
     for number, kernel in enumerate(chosen):
-        if os.getppid() != parent and sys.platform != "win32":  # there a launcher stands between
+        if os.getppid() != parent and sys.platform != "win32":  # where a launcher is in between
             return
         with contextlib.suppress(FileExistsError):
             try:
@@ -400,7 +400,7 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
                 return
 
 
-_task: Any = None  # a unit, of each function below that is compiled its own; see `_versioned`
+_task: Any = None  # a unit; each compiled function below gets its own, see `_versioned`
 _fails: Any = None
 
 
@@ -415,7 +415,7 @@ def _loop(values: Any, first: int, last: int) -> int:
 
 
 def _run_plain(task: Unit, n: int, values: Any) -> int:
-    """How many calls of a unit fail, on threads of Python's: numba's own take no records."""
+    """Call a unit on Python threads, as numba's own take no records; return how many calls fail."""
     n_threads, loop = numba.get_num_threads(), task.loop
     step = max(1, n // (PIECES_PER_THREAD * n_threads))
 
@@ -428,9 +428,9 @@ def _run_plain(task: Unit, n: int, values: Any) -> int:
 
 
 def run(task: Any, n: int, values: Any) -> None:
-    """Call a unit `task(values, number)` for all numbers up to n, on as many threads as numba is set to.
+    """Call a unit `task(values, number)` for all numbers below n, on numba's threads.
 
-    `values` is a record. The calls must not depend on one another. MemoryError where one fails: units raise no other.
+    `values` is a record. The calls must be independent. If one fails, MemoryError is raised, the only error of units.
     """
     if numba.config.DISABLE_JIT:
         for number in range(n):
@@ -447,10 +447,10 @@ def run(task: Any, n: int, values: Any) -> None:
         with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
             n_failed = links().run(task.address, laid_out.address, n)
     if n_failed > 0:
-        raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls found no memory for their arrays")
+        raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls could not allocate their arrays")
 
 
-# Of functions that Python does not call.
+# For functions that Python does not call.
 _machine_code = partial(njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
@@ -465,27 +465,27 @@ def entry(function: Callable[..., Any]) -> Any:
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """What goes into the functions that call it."""
+    """Compile a function into each function that calls it."""
     return _machine_code(_nrt=_counts(function))(function)
 
 
-inlined = njit(error_model="numpy", inline="always")  # likewise, as numba reads it, before LLVM does
+inlined = njit(error_model="numpy", inline="always")  # a helper that numba inlines itself, before LLVM
 
 
 def own(records: Any) -> Any:
-    """The record of the thread that runs a task, of a list with one for each."""
+    """Return the record of the thread that runs a task, from a list with one per thread."""
     return records[0]
 
 
-@overload(own, strict=False)  # else annotations count as names of arguments
+@overload(own, strict=False)  # otherwise annotations count as names of arguments
 def _own_compiled(records: Any) -> Any:
-    if isinstance(records, types.BaseTuple):  # by value, of the thread alone; see `_run_plain`
+    if isinstance(records, types.BaseTuple):  # by value, already the thread's own; see `_run_plain`
         return lambda records: records
     nth = links().nth
     return lambda records: nth(records, numba.get_thread_id())
 
 
-# Whether the inside of numba does what it is used for.
+# Test of the internals of numba.
 
 
 class _Row(NamedTuple):
@@ -504,7 +504,7 @@ def _double_both(row: Any, address: int, place: int) -> tuple[bool, bool]:
 
 
 def check_links() -> None:
-    """Compile a unit and call it by its symbol and its address; an error of any kind if that fails."""
+    """Compile a unit and call it by its symbol and its address; raises an error of any kind if that fails."""
     doubled = Unit(_double)
     ALL_KERNELS.remove(doubled)
     doubled._make_known()

@@ -1,4 +1,4 @@
-"""A lock on a file, which the system takes from a process when that ends."""
+"""A lock on a file, which the system releases when the process ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HAS_LOCKS = fcntl is not None
 
 
 def lock_file(stream: IO[Any], *, is_shared: bool = False) -> bool:
-    """Lock an open file until it is closed; False if another process has it. Windows locks nothing.
+    """Lock an open file until it is closed; return False if another process holds the lock. Windows locks nothing.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""What public functions take, by their annotations: one place for all public functions, one line for a mistake.
+"""Checks of the arguments of all public functions by their annotations, with a one-line message for a mistake.
 
-Ranges (NaN is in none), shapes and what belongs together are the functions' own to check. A look at Images, Meshes and
-the other records alone would be a third of this, and let 227 of the 1505 wrong calls in tests/system/test_public.py end
-in an AttributeError, a ValueError, an IndexError, a KeyError or an OverflowError of the functions within.
+Functions check ranges (which exclude NaN), shapes and consistency themselves. Checking only Images, Meshes and other
+records would take a third of this code, but 227 of the 1505 wrong calls in tests/system/test_public.py would end in an
+AttributeError, a ValueError, an IndexError, a KeyError or an OverflowError from inner functions.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ import numpy as np
 import tetopt
 from tetopt.errors import InputError
 
-ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # as annotations call them
-TABLE_WORDS = ("Points", "Cells")  # of these, those of a row each, which are taken as they are
-# How each is made, for who gives something else.
+ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # annotations of arrays
+TABLE_WORDS = ("Points", "Cells")  # those with two axes, which are not converted
+# Remedies for messages: how to get an object of each class.
 REMEDIES = {
-    "Image": "tetopt.load_image(path) reads one, tetopt.Image(array, affine) makes one",
-    "Mesh": "tetopt.load_mesh(path).mesh reads one, tetopt.mesh_image(...).mesh is one",
-    "Model": "tetopt.build_model(mesh, ...) makes one",
-    "Solution": "tetopt.solve(model) returns one",
-    "Surface": "tetopt.extract_surface(points, cells, chosen) returns one",
+    "Image": "use tetopt.load_image(path) or tetopt.Image(array, affine)",
+    "Mesh": "use tetopt.load_mesh(path).mesh or tetopt.mesh_image(...).mesh",
+    "Model": "use tetopt.build_model(mesh, ...)",
+    "Solution": "use tetopt.solve(model)",
+    "Surface": "use tetopt.extract_surface(points, cells, chosen)",
 }
 NAMES_OF_KINDS = {
     "int": "a whole number",
     "float": "a number",
-    "str": "a text",
+    "str": "a string",
     "bool": "True or False",
-    "Points": "an array of a row a point",
-    "Cells": "an array of a row a cell",
+    "Points": "an array with one row per point",
+    "Cells": "an array with one row per cell",
 }
-LARGEST_INTEGER = 2**63 - 1  # of numpy's: nothing that is counted here is more
+LARGEST_INTEGER = 2**63 - 1  # numpy's largest: no count here exceeds it
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, whose arguments are looked at by `check_arguments` before it is called."""
+    """Decorate a function so that `check_arguments` checks its arguments before each call."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -54,10 +54,10 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """InputError unless the arguments, by name, are of the kinds that the function's annotations name.
+    """Raise InputError unless the arguments, by name, have the types that the function's annotations name.
 
-    Annotations that name anything but Images, Meshes, numbers, texts, paths, arrays, sequences and tables of them, and
-    classes of the function's module, are not looked at.
+    Checked annotations are Images, Meshes and other records, numbers, strings, paths, arrays, sequences and dicts of
+    these, and classes of the function's module. All others are ignored.
     """
     for name, value in arguments.items():
         parameter = inspect.signature(function).parameters[name]
@@ -67,11 +67,11 @@ def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> 
 
 
 def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> None:
-    """InputError unless `value` is of one of the kinds between the annotation's bars, or one of them is not known."""
+    """Raise InputError unless `value` has one of the types between the annotation's bars, or one of them is unknown."""
     kinds = re.split(r" \| (?![^\[]*\])", annotation)
     answers = [_is_of(kind, value, names) for kind in kinds]
     if True in answers or None in answers:
-        if "Sizes" in kinds and isinstance(value, tuple):  # a record that its makers do not check
+        if "Sizes" in kinds and isinstance(value, tuple):  # a record whose constructor checks nothing
             for field, kind in type(value).__annotations__.items():
                 _check(f"{what}.{field}", getattr(kind, "__forward_arg__", str(kind)), getattr(value, field), names)
         return
@@ -81,7 +81,7 @@ def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> Non
 
 
 def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
-    """Whether a value is of a kind; None if the kind is not known here."""
+    """Return whether a value has a type; None if the type is unknown here."""
     head, _, inner = kind.rstrip("]").partition("[")
     if kind == "None":
         return value is None
@@ -101,7 +101,7 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
         item = inner.split(",")[0]
         return not isinstance(value, list | tuple) or all(_is_of(item, each, names) is not False for each in value)
     known = getattr(tetopt, kind) if kind in REMEDIES else names.get(kind)
-    if get_origin(known) is Literal:  # which text, the function's own message tells
+    if get_origin(known) is Literal:  # the function itself checks the value
         return isinstance(value, str)
     return isinstance(value, known) if isinstance(known, type) else None
 
@@ -123,14 +123,14 @@ def _is_number(value: Any, is_whole: bool) -> bool:
 def _is_array(value: Any) -> bool:
     try:
         return np.asarray(value).dtype.kind in "buif"
-    except (TypeError, ValueError):  # rows of different length, or what numpy cannot take
+    except (TypeError, ValueError):  # rows of different lengths, or an object that numpy cannot convert
         return False
 
 
 def _shown(value: Any) -> str:
-    """A value in a message: numbers and short texts themselves, else what they are."""
+    """Format a value for a message: numbers and short strings themselves, otherwise their type."""
     if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-        return f"one of {value.bit_length()} bits"
+        return f"a number of {value.bit_length()} bits"
     if isinstance(value, bool | int | float | str | np.number | None):
         text = ascii(value) if isinstance(value, str) else str(value)
         return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,9 +1,9 @@
-"""Work directories: what unfinished runs keep on disk, trusted only as far as it has been checked.
+"""Work directories: the files of unfinished runs on disk, which are not trusted until they are checked.
 
-A cohort (OUT/.work), a mesh in parts (MESH.work) and a comparison (OUT/runs) each have one. It is for the owner alone
-(0700), and its manifest lists the names that tetopt writes and removes there. A run begins only if it holds nothing but
-files and folders of these names: no link, pipe or device, and no file of somebody else's. It is opened, looked at and
-removed by its descriptor, which no link takes elsewhere; Windows has none, so that there paths are checked instead.
+A cohort (OUT/.work), a mesh in parts (MESH.work) and a comparison (OUT/runs) each have one. Only the owner can open it
+(0700), and its manifest lists the names that tetopt writes and removes there. A run begins only if it contains nothing
+but files and folders with these names: no links, pipes, devices or other files. It is opened, checked and removed by
+its descriptor, which no link can redirect; Windows has no descriptors of folders, so paths are checked there instead.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from tetopt.system.files import TEMPORARY_LETTERS, save_json
 from tetopt.system.incoming import KINDS_OF_FILES, UNFOLLOWED, irregular, own_bytes
 from tetopt.system.lock import HAS_LOCKS, lock_file
 
-HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders: Windows has none
+HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders; Windows has none
 MANIFEST_NAME, LOCK_NAME = "tetopt-manifest", "lock"
-MANIFEST_BYTES = 10_000  # at most: those that tetopt writes have some 200
-# As `tetopt.system.files.written_whole` names files under way; a killed run leaves them.
+MANIFEST_BYTES = 10_000  # at most: tetopt's own have about 200
+# Temporary names of `tetopt.system.files.written_whole`; a killed run leaves such files behind.
 TEMPORARY = re.compile(rf"\.(.{{1,{TEMPORARY_LETTERS}}})\.[a-z0-9_]{{8}}.{{0,20}}")
-# What systems put into folders: files removed while open on NFS, and macOS's Finder.
+# Files that systems create: files removed while open on NFS, and those of macOS's Finder.
 SYSTEM_NAMES = r"\.nfs[0-9a-f]+|\.DS_Store"
-ADVICE = "move it away, and run this again"
+ADVICE = "move it away and run this again"
 
 
 class Layout(NamedTuple):
     """The names in a work directory, as regular expressions."""
 
-    work: str  # what it is of
+    work: str  # a description of the run that it belongs to
     files: str
-    folders: dict[str, str | None] = {}  # noqa: RUF012 (not changed): of each the names of its files; None: unopened
+    folders: dict[str, str | None] = {}  # noqa: RUF012 (not changed): the names of the files in each; None: not opened
 
     def problem(self, name: str, mode: int) -> str | None:
-        """What is wrong with an entry of this name and mode; None for one of ours."""
+        """Return what is wrong with an entry of this name and mode; None for one of tetopt's."""
         if any(re.fullmatch(folder, name) for folder in self.folders):
             return None if stat.S_ISDIR(mode) else f"expected a folder, got {_kind(mode)}"
         if re.fullmatch(f"{MANIFEST_NAME}|{SYSTEM_NAMES}|{self.files}", name) or self._is_temporary(name):
@@ -57,19 +57,19 @@ class Layout(NamedTuple):
 
 
 class WorkDirectory(NamedTuple):
-    """A work directory that is open."""
+    """An open work directory."""
 
     path: Path
     layout: Layout
     descriptor: int | None  # None on Windows
 
     def check(self) -> None:
-        """Find anything that is not tetopt's.
+        """Check that everything in it is tetopt's.
 
         Raises
         ------
         InputError
-            No manifest, or another one; a name that it does not list; a link, a pipe, a device.
+            The manifest is missing or different; an entry is not listed in it; there is a link, pipe or device.
         """
         if not self.is_new():
             self._check_manifest()
@@ -95,17 +95,17 @@ class WorkDirectory(NamedTuple):
             )
 
     def is_new(self) -> bool:
-        """Whether it is empty but for the temporary files of a run that creates it just now, or was killed there."""
+        """Return whether it is empty, except for temporary files of a run that is creating it or was killed then."""
         own = self.own()
         return all(name in own and TEMPORARY.fullmatch(name) for name in _modes(self.path, self.descriptor))
 
     def own(self) -> dict[str, int]:
-        """The modes of the entries that are tetopt's, by name."""
+        """Return the modes of tetopt's own entries, by name."""
         modes = _modes(self.path, self.descriptor)
         return {name: mode for name, mode in modes.items() if self.layout.problem(name, mode) is None}
 
     def remove(self, name: str, mode: int) -> None:
-        """Remove an entry of `own`; links within it are removed, and not followed."""
+        """Remove an entry of `own`; links within it are removed, not followed."""
         with suppress(FileNotFoundError):
             if stat.S_ISDIR(mode):
                 shutil.rmtree(self._place(name), dir_fd=self.descriptor)
@@ -113,20 +113,20 @@ class WorkDirectory(NamedTuple):
                 os.unlink(self._place(name), dir_fd=self.descriptor)
 
     def _place(self, name: str) -> str:
-        """The name by which an entry is found from the descriptor, or without one from anywhere."""
+        """Return the name of an entry relative to the descriptor, or its whole path without one."""
         return str(self.path / name) if self.descriptor is None else name
 
     def lock(self, stack: ExitStack, name: str, *, is_shared: bool, what: str) -> None:
-        """Take the lock of a file until the stack is unwound, or the process ends; its owner stands in the file."""
+        """Lock a file until the stack is unwound or the process ends; the file names the owner of the lock."""
         if not HAS_LOCKS:
             return
         handle = os.open(self._place(name), os.O_RDWR | os.O_CREAT | UNFOLLOWED, 0o600, dir_fd=self.descriptor)
         stream = stack.enter_context(os.fdopen(handle, "r+", encoding="utf-8", errors="replace"))
         if os.fstat(handle).st_nlink > 1:
-            raise InputError(f"{self.path / name}: expected a file of one name, got one with a hard link; {ADVICE}")
+            raise InputError(f"{self.path / name}: expected a file without hard links, got one with them; {ADVICE}")
         if not lock_file(stream, is_shared=is_shared):
             whose = stream.read(200).strip() or "another process"
-            raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it")
+            raise InputError(f"{what}: another run is writing there ({whose}); wait until it ends, or stop it")
         if not is_shared:
             stream.truncate(0)
             stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")
@@ -134,7 +134,7 @@ class WorkDirectory(NamedTuple):
 
 
 def create(path: Path, layout: Layout) -> None:
-    """Create a work directory with its manifest; an empty folder becomes one, and anything else stays as it is."""
+    """Create a work directory with its manifest; an empty folder becomes one, anything else is left unchanged."""
     with suppress(FileExistsError):
         path.mkdir(mode=0o700)
     if irregular(path, follow=False) != "a folder":
@@ -147,15 +147,15 @@ def create(path: Path, layout: Layout) -> None:
 
 @contextmanager
 def locked(path: Path, layout: Layout, what: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
-    """A work directory, created if it is not there, for one run alone; with `keys` beside runs of other keys.
+    """Lock a work directory, created if missing, for a single run; with `keys`, runs of other keys may share it.
 
-    A lock ends with its process, also one that is killed.
+    A lock ends with its process, even if the process is killed.
 
     Raises
     ------
     InputError
-        Another run has it, or one of the keys, which is said of `what`; it holds what is not tetopt's, or a lock that
-        has a second name, under which it would be changed.
+        Another run holds it or one of the keys, which the message reports for `what`; it contains entries that are
+        not tetopt's, or a lock file with a hard link, through which another file would be changed.
     """
     create(path, layout)
     with ExitStack() as stack:
@@ -174,14 +174,14 @@ def opened(path: Path, layout: Layout) -> Iterator[WorkDirectory]:
     Raises
     ------
     InputError
-        A link, no folder, or one that may not be opened.
+        It is a link, is not a folder, or cannot be opened.
     """
     with _descriptor(path, str(path)) as descriptor:
         yield WorkDirectory(path, layout, descriptor)
 
 
 def discard(path: Path, layout: Layout) -> list[str]:
-    """Remove a work directory; what is not tetopt's stays, the folder with it, and is returned by name."""
+    """Remove a work directory; entries that are not tetopt's remain, with the folder, and their names are returned."""
     with opened(path, layout) as work:
         for name, mode in work.own().items():
             work.remove(name, mode)
@@ -192,7 +192,7 @@ def discard(path: Path, layout: Layout) -> list[str]:
 
 
 def check_files(path: Path, work: str) -> None:
-    """InputError for a folder that is a link, or holds anything but regular files."""
+    """Raise InputError for a folder that is a link or contains anything but regular files."""
     with _descriptor(path, str(path)) as descriptor:
         _check_files(path, descriptor, Layout(work, ".+"))
 
@@ -205,7 +205,7 @@ def _check_files(path: Path, descriptor: int | None, layout: Layout) -> None:
 
 @contextmanager
 def _descriptor(path: Path, name: str, parent: int | None = None) -> Iterator[int | None]:
-    """A descriptor of the folder of this name in the parent's, or of this path; None on Windows."""
+    """Open a descriptor of the folder with this name in the parent's, or with this path; None on Windows."""
     try:
         kind = irregular(path, follow=False) or "a file"
         if kind != "a folder":
@@ -221,7 +221,7 @@ def _descriptor(path: Path, name: str, parent: int | None = None) -> Iterator[in
 
 
 def _modes(path: Path, descriptor: int | None) -> dict[str, int]:
-    """The modes of what is in a folder, links not followed, by name."""
+    """Return the modes of the entries of a folder, by name, without following links."""
     modes = {}
     with os.scandir(path if descriptor is None else descriptor) as entries:
         for entry in entries:
