@@ -427,9 +427,9 @@ BAD_OPTIONS = [
     ("--slice k=99", "slice: expected an index from 0 to 15 along axis 2, got 99"),
     ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
     ("--crop 0:99,:,:", "crop"),
-    ("--volume 1", "volume 1 asked for"),
+    ("--volume 1", "got 1: the file has one volume"),
     ("--json no/such/run.json", "folder does not exist"),
-    ("--json run.txt", "ends in .json"),
+    ("--json run.txt", "ending in .json"),
     ("--unknown", "No such option: --unknown"),
     ("second.nii", "second.nii"),
 ]
@@ -454,13 +454,13 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown image format"),
         ("quality no.vtu", "no such file"),
-        ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .msh or .msh2"),
+        ("quality {disc}", "expected a .vtu, .vtk, .vtkhdf, .msh or .msh2 mesh"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality", "Missing argument 'MESH'"),
         ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),
-        ("phantom sphere -o a.png", "ends in .nii or .nii.gz"),
+        ("phantom sphere -o a.png", "ending in .nii or .nii.gz"),
         ("phantom sphere -o a.nii --labels ./a.nii", "or another output"),
         ("phantom sphere -o a.nii --voxel-mm 0", "--voxel-mm: "),
         ("phantom sphere -o a.nii --noise-sd -1", "--noise-sd: "),
@@ -483,9 +483,9 @@ def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
         (tmp_path / name).write_text("old")
     new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert_refused(capfd, mesh, "a.json: already exists; pass --force")
-    assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
-    assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
-    assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
+    assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "already exists")
+    assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "already exists")
+    assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "already exists")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(("a.nii", "b.nii", "a.json"), "old")
 
 

@@ -560,7 +560,7 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
         assert "triangles" in capsys.readouterr().err
     flat = ["mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / "a.vtu", "--nodes", "60"]
     assert exit_code(*flat, "--space", "lps") == 2
-    assert "leave out --space" in capsys.readouterr().err
+    assert "omit --space" in capsys.readouterr().err
     assert (
         exit_code("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
     )
@@ -620,7 +620,7 @@ def test_a_field_that_is_not_there(folder, tmp_path, capsys):
         assert exit_code("surface", tmp_path / "bare.vtu", "-o", tmp_path / "s.stl", *more) == 2
         assert "; it has none" in capsys.readouterr().err
     assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
-    assert "ends in .stl or .ply or .vtp or .vtk" in capsys.readouterr().err
+    assert "ending in .stl or .ply or .vtp or .vtk" in capsys.readouterr().err
 
 
 # Looking
@@ -649,7 +649,7 @@ def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, cap
         (["--range", "3"], "--range: expected LOW,HIGH, such as 0,120"),
         (["--range", "low,3"], '--range: expected a number, got "low"'),
         (["--range", "3,2"], "--range: expected LOW,HIGH with LOW below HIGH"),
-        (["--screenshot", tmp_path / "a.jpg"], "ends in .png"),
+        (["--screenshot", tmp_path / "a.jpg"], "ending in .png"),
     ):
         assert exit_code(*words[:3], tmp_path / "b.html", *options) == 2
         assert message in capsys.readouterr().err

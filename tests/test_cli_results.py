@@ -83,7 +83,7 @@ def test_refusals_write_nothing(folder, capsys):
 
     refused("--results: expected an output file .vtu or .vtk", folder / "b.inp", "--results", folder / "a.frd")
     refused("no such file", folder / "b.vtu", "--results", folder / "c.frd")
-    refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
+    refused("belongs to another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
     (folder / "c.vtu").write_bytes((folder / "a.frd").read_bytes())
     refused("is also an input", folder / "c.vtu", "--results", folder / "c.vtu", "--force")

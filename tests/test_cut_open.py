@@ -108,4 +108,4 @@ def test_the_script(tmp_path, capsys, opengl):
     assert capsys.readouterr().out == f"{picture}: a.vtu, cut open\n"
     assert np.asarray(PIL.Image.open(picture).convert("L")).std() > 20.0
     assert cut_open.main([mesh, "--image", image, "-o", picture]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err

@@ -247,7 +247,7 @@ def test_resume_keeps_what_is_done(run, head, undrawn, tmp_path, capsys):
     assert main([*again, "--k-d", "0.3", "--pipelines", "bcc", "--curve", ""]) == 0
     assert "finished before" not in capsys.readouterr().err
     assert main([word for word in again if word != "--resume"]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     kept = (out / "report.json").read_bytes()
     assert main(["compare", inputs[0], "-o", str(out), "--nodes", "99", "--resume"]) == 2
     assert "belongs to another comparison" in capsys.readouterr().err
