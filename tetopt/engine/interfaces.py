@@ -204,12 +204,13 @@ def _count_kinds(first: NDArray, entries: NDArray, start: NDArray, n_labels: int
 def _sum_kinds(
     row: NDArray, volume: NDArray, first: NDArray, entries: NDArray, start: NDArray, each: NDArray, n_labels: int
 ) -> None:
-    total = np.zeros(n_labels)
+    total, last = np.zeros(n_labels), np.full(n_labels, -1, dtype=np.int64)
     for cell in range(len(start) - 1):
         end = first[cell]
         for i in range(start[cell], start[cell + 1]):
             label = entries[i]
-            if total[label] == 0.0:
+            if last[label] != cell:
+                last[label], total[label] = cell, 0.0
                 m = end
                 while m > first[cell] and row[m - 1] > label:  # in rising order
                     row[m] = row[m - 1]
@@ -219,7 +220,6 @@ def _sum_kinds(
             total[label] += each[cell]
         for m in range(first[cell], end):
             volume[m] = total[row[m]]
-            total[row[m]] = 0.0
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:

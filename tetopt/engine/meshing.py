@@ -356,6 +356,8 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) ->
         if corners == before:
             break
         result = run(corners)._replace(nodes=nodes)
+        if nearest and result.ended in CUT_SHORT:
+            return nearest[0][1]._replace(ended=result.ended)
         count = node_count(result.mesh.points, result.mesh.cells, 2)
         ratio = count / len(result.mesh.points)
         miss = abs(count / nodes - 1.0)
@@ -407,7 +409,8 @@ def meshed_to_error(
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
         count, fraction = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
         if result.ended in CUT_SHORT:
-            return best[0] if best and fractions[len(best[0].mesh.points)] <= target_error else result
+            is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(target_error, fraction)
+            return best[0]._replace(ended=result.ended) if is_worse else result
         if count in fractions:
             break
         fractions[count] = fraction

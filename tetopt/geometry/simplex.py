@@ -48,7 +48,7 @@ def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     if frames.shape[1] == 2:
         return frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]
     (a, b, c), (d, e, f), (g, h, i) = (frames[:, row].T for row in range(3))
-    return (a * (e * i - f * h) + c * (d * h - e * g)) + b * (f * g - d * i)
+    return (a * (e * i - f * h) + c * (d * h - e * g)) + b * (f * g - d * i) + 0.0  # no -0
 
 
 def oriented(points: Points, cells: Cells) -> NDArray[np.int64]:

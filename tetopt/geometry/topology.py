@@ -37,7 +37,7 @@ class Facets(NamedTuple):
 
 def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
     """The star of each of `n_nodes` nodes: the cells around it."""
-    order, start = _by_number(cells.ravel(), n_nodes)
+    order, start = _by_number(np.ascontiguousarray(cells, dtype=np.int64).ravel(), n_nodes)
     return Stars(start, order // cells.shape[1])
 
 

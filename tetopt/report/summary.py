@@ -175,15 +175,23 @@ def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, s
 
     With `failed`, a measure that raises an error is omitted and its reason is noted there, so that the others complete.
     """
-    measured = {}
-    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        taken = {name: threads.submit(copy_context().run, measure) for name, measure in measures.items()}
-    for name, each in taken.items():
-        try:
-            measured[name] = each.result()
-        except Exception as error:
-            if failed is None:
-                raise
-            words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-            failed[name] = words.removesuffix(": ")
+    measured, n_threads = {}, numba.get_num_threads()
+
+    def limited(measure: Callable[[], Any]) -> Any:
+        numba.set_num_threads(n_threads)  # which numba keeps for each thread of Python
+        return measure()
+
+    threads = ThreadPoolExecutor(n_threads)
+    try:
+        taken = {name: threads.submit(copy_context().run, limited, measure) for name, measure in measures.items()}
+        for name, each in taken.items():
+            try:
+                measured[name] = each.result()
+            except Exception as error:
+                if failed is None:
+                    raise
+                words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+                failed[name] = words.removesuffix(": ")
+    finally:  # an interrupted run, or one that failed, does not begin the rest
+        threads.shutdown(wait=False, cancel_futures=True)
     return measured
