@@ -130,9 +130,9 @@ def test_runs_are_watched():
     ("arguments", "words"),
     [
         ({"mode": "coarse"}, "expected mode graded, uniform, paper, start, got 'coarse'"),
-        ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, but no kind"),
-        ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, but no sizes"),
-        ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, but no nodes"),
+        ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, not kind"),
+        ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, not sizes"),
+        ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
         ({"mode": "uniform"}, "give exactly one of nodes and spacing"),
         ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give exactly one of nodes and spacing"),
         ({"mode": "start"}, "requires a mesh to start from"),

@@ -75,7 +75,7 @@ def test_a_mask_and_overlaps():
     assert result.violated == {}
     last = result.history[-1]
     twice = result._replace(history=[last._replace(n_voxels=last.n_voxels + 2)])
-    assert "2 voxels twice" in violated(target, twice)["overlap"]
+    assert "2 voxels lie in two cells" in violated(target, twice)["overlap"]
     n_cells = len(result.mesh.cells)
     part = part_of(result.mesh, np.arange(n_cells) < n_cells // 2)
     n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
