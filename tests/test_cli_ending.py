@@ -202,8 +202,8 @@ ARRAY_MEMORY_ERROR = (np.core if np.__version__.startswith("1.") else np._core).
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (MemoryError(), "not enough memory; take"),
-        (MemoryError("to lay out"), "not enough memory: to lay out; take"),
+        (MemoryError(), "not enough memory; use"),
+        (MemoryError("to lay out"), "not enough memory: to lay out; use"),
         (ARRAY_MEMORY_ERROR((10**6, 10**6), np.dtype(float)), "not enough memory: .*7.28 TiB"),
     ],
 )

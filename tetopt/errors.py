@@ -19,7 +19,7 @@ class InputError(ValueError):
     ...     tetopt.load_phantom("spehre")
     ... except tetopt.InputError as error:
     ...     print(error)
-    phantom 'spehre': no such phantom; give one of constant, disc_2d, ...
+    phantom 'spehre': no such phantom; use one of constant, disc_2d, ...
     """
 
 
