@@ -715,7 +715,7 @@ def test_a_4d_file_needs_a_volume(tmp_path, data_dir, capfd):
     path = data_dir / "example4d.nii.gz"
     command = ["mesh", path, "-o", tmp_path / "a.vtu", "--nodes", "100", "--iterations", "1"]
     assert_refused(capfd, command, "2 volumes; choose one")
-    assert_refused(capfd, [*command, "--volume", "2"], "volume 2 asked for")
+    assert_refused(capfd, [*command, "--volume", "2"], "expected a volume from 0 to 1, got 2")
     assert list(tmp_path.iterdir()) == []
     assert exit_code(*map(str, command), "--volume", "1") == 0
     file, image = load_mesh(tmp_path / "a.vtu"), load_image(path, volume=1)
