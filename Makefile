@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench measured bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -139,6 +139,12 @@ bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/fit_cost.py --rows cost_runs.jsonl -o cost.toml --force
 
+# Every number of docs/measured and of README's table, and these pages: 1.5 hours. DATA is a folder with the images that
+# scripts/measure.py names; PEERS are its options for CGAL, whose programs docs/howto/own_mesher.md describes.
+measured: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/measure.py $(DATA) $(PEERS)
+
 # Memory and time of a mesh in parts, of EDGE^3 voxels: 1024 takes three quarters of an hour, and 2 GB in FOLDER.
 EDGE ?= 1024
 FOLDER ?= /tmp
@@ -164,4 +170,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo docs/_build docs/gallery bench.json bench_kernels.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
+	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo measured docs/_build docs/gallery bench.json bench_kernels.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json

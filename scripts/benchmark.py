@@ -110,7 +110,7 @@ def process_seconds(
 
 
 def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any]:
-    """Time tetopt, pytetwild and CGAL in turns, at about equal numbers of nodes: the minimum over whole processes.
+    """Time tetopt, pytetwild (once) and CGAL in turns, at about equal numbers of nodes: minimum over whole processes.
 
     The others mesh the tissue labels of the MNI152 T1, or two classes of another image. CGAL is a program
     `cgal LABELS.raw nx ny nz sx sy sz OUT.bin SIZE` that prints JSON with `nodes`; SIZE is chosen to give about the
@@ -133,8 +133,10 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
         else:
             commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
         seconds: dict[str, list[tuple[float, float]]] = {}
-        for _ in range(turns):
+        for turn in range(turns):
             for name, command in commands.items():
+                if turn > 0 and name == "pytetwild":
+                    continue  # once is enough: it takes ten times as long
                 seconds.setdefault(name, []).append(process_seconds(command))
         for name, times in seconds.items():
             wall, cpu = (min(column) for column in zip(*times, strict=True))
@@ -227,7 +229,7 @@ def stopped(seconds: float) -> dict[str, float]:
 
 
 def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
-    """Time a head of five tissues within its mask, with the command of docs/measured/labels.md, and then CGAL.
+    """Time a head of five tissues within its mask, and then CGAL.
 
     CGAL is a program `cgal LABELS.raw SIZES.raw nx ny nz sx sy sz OUT.bin 1` that perturbs and exudes, and prints JSON
     with `nodes`; its sizes are tetopt's target sizes by tissue and thickness, times a factor that gives about the same
@@ -243,7 +245,7 @@ def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
         wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"], allowed=(0, 1))
         run = json.loads((folder / "run.json").read_text())
         rows = {"nodes": nodes, "cells": len(tetopt.load_mesh(out).mesh.cells), "wall": wall, "cpu": cpu}
-        rows |= {"peak_gb": run["memory"]["peak_bytes"] / 1e9, "violated": [*run["violated"]]}
+        rows |= {"peak_gb": run["memory"]["peak_bytes"] / 1e9, "violated": [*run["violated"]], "run": run}
         if cgal is not None:
             asked = tetopt.Sizes(smallest=1.0, by_label=parse_label_sizes(words))
             field = tetopt.sizes_by_label(asked, tetopt.content(image, image)).sizes.on_voxels(image)
@@ -312,7 +314,8 @@ def show(rows: dict[str, Any]) -> None:
             words = f"{row['wall']:.1f} s, {row['cpu']:.1f} of CPU" if isinstance(row, dict) else row
             print(f"  peers, whole process: {name} {words}")
     for name in ("labelled", "masked_start", "stopped", "head"):
-        print(f"  {name}: {json.dumps(rows.get(name, 'no labels named (--head)'))}")
+        row = rows.get(name, {"": "no labels named (--head)"})
+        print(f"  {name}: {json.dumps({key: value for key, value in row.items() if key != 'run'})}")
     for row in [*rows["graded"], rows["graded_large"]]:
         print(
             f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s, peak "
