@@ -230,8 +230,8 @@ MEASUREMENTS = {
     ),
     "averages": Measurement(
         (
-            "python tests/benchmarks/choose_average.py -o averages.json --dofs 150000 $T1 $CT_SLAB --phantoms ellipsoids_brain "
-            "--averages mean geometric harmonic hill gauss --force",
+            "python tests/benchmarks/choose_average.py -o averages.json --dofs 150000 $T1 $CT_SLAB "
+            "--phantoms ellipsoids_brain --averages mean geometric harmonic hill gauss --force",
         ),
         listed("averages.json"),
     ),
