@@ -160,7 +160,7 @@ class Measurement(NamedTuple):
 
 
 COMPARED = "-o compared --repeats 1 --curve ''"
-CGAL = "--pipeline 'cgal=python $CGAL_LABELS {labels} -o {output} --size {size}'"
+CGAL = "--pipeline 'cgal=$PYTHON $CGAL_LABELS {labels} -o {output} --size {size}'"
 PHANTOMS = "sphere two_spheres ellipsoids_brain"
 MEASUREMENTS = {
     "mni152": Measurement(
@@ -259,6 +259,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         given |= {name: getattr(options, name) for name in PROGRAMS if getattr(options, name) is not None}
         paths = {name: str(path.resolve()) for name, path in given.items() if path.is_file()}
         needed = {name: words_of(name) for name in options.only}
+        paths["PYTHON"] = sys.executable
         missing = {each for words in needed.values() for each in words} - set(paths)
         if missing:
             print(f"measure: expected a file for each of {', '.join(sorted(missing))}, got none", file=sys.stderr)
