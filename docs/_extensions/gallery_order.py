@@ -1,28 +1,28 @@
-"""The order of the gallery's programs: from an image to a mesh, what it is worth, and on to solvers."""
+"""The order of the gallery's programs: what most users do first, then method, solvers and other libraries."""
 
 ORDER = (
     "first_mesh",
-    "ventricles",
     "organ_from_mask",
     "tissues_from_labels",
-    "nested_shells",
-    "calculix",
-    "two_contrasts",
     "target_error",
-    "k_d",
+    "calculix",
+    "fields_on_voxels",
+    "nested_shells",
+    "two_contrasts",
+    "ventricles",
     "slice_2d",
+    "k_d",
     "quadratic_cells",
     "elastography",
     "scikit_fem",
     "fenicsx",
     "improve_pytetwild",
     "own_phantom",
-    "fields_on_voxels",
     "other_libraries",
     "own_format",
 )
 
 
 def position(file: str) -> int:
-    """Of a program, for sphinx-gallery."""
+    """Return the place of a program, for sphinx-gallery."""
     return ORDER.index(file.removeprefix("plot_").removesuffix(".py"))

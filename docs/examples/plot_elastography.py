@@ -44,14 +44,19 @@ print(f"the large nodule is {contrast:.2f} times as stiff as the surroundings, b
 # The strain image, the mesh with its moduli, and the true moduli.
 
 extent = (-28, 28, -28, 28)
-figure, axes = plt.subplots(1, 3, figsize=(12.5, 4.2), layout="constrained")
-drawn = axes[0].imshow(100 * strain.data.T, origin="lower", extent=extent, cmap="gray", vmin=0.2, vmax=1.6)
-figure.colorbar(drawn, ax=axes[0], label="axial strain, %", shrink=0.8)
+# sphinx_gallery_thumbnail_number = 2
+figure, of_strain = plt.subplots(figsize=(5, 4.2), layout="constrained")
+drawn = of_strain.imshow(100 * strain.data.T, origin="lower", extent=extent, cmap="gray", vmin=0.2, vmax=1.6)
+figure.colorbar(drawn, ax=of_strain, label="axial strain, %", shrink=0.8)
 look = {"cmap": "inferno", "vmin": 5, "vmax": 60}
-drawn = axes[1].tripcolor(*mesh.points.T, mesh.cells, young, edgecolors="#5a6472", linewidth=0.3, **look)
-axes[2].imshow(truth.data.T, origin="lower", extent=extent, **look)
-figure.colorbar(drawn, ax=axes[1:], label="Young's modulus, kPa", shrink=0.8)
-for ax, title in zip(axes, ("strain image", "1/strain on the mesh", "truth"), strict=True):
+figure, of_mesh = plt.subplots(figsize=(5, 4.2), layout="constrained")
+drawn = of_mesh.tripcolor(*mesh.points.T, mesh.cells, young, edgecolors="#5a6472", linewidth=0.3, **look)
+figure.colorbar(drawn, ax=of_mesh, label="Young's modulus, kPa", shrink=0.8)
+figure, of_truth = plt.subplots(figsize=(5, 4.2), layout="constrained")
+drawn = of_truth.imshow(truth.data.T, origin="lower", extent=extent, **look)
+figure.colorbar(drawn, ax=of_truth, label="Young's modulus, kPa", shrink=0.8)
+titles = {of_strain: "strain image", of_mesh: "1/strain on the mesh", of_truth: "truth"}
+for ax, title in titles.items():
     ax.set(aspect="equal", title=title)
     ax.axis("off")
 plt.show()

@@ -61,11 +61,11 @@ print(f"displacement: off by {off_mm:.4f} mm in the mean, of up to {np.abs(solut
 # %%
 # Stress and displacement on the voxels of the middle slice, with contours of the image.
 
-figure, axes = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
 middle = image.shape[1] // 2 - 1
 extent = (-40, 40, -30, 30)  # mm, the block
 panels = (("von Mises stress, kPa", stress.data, "inferno"), ("upward displacement, mm", read[..., 2], "viridis"))
-for ax, (title, data, colours) in zip(axes, panels, strict=True):
+for title, data, colours in panels:
+    figure, ax = plt.subplots(figsize=(5.5, 4.4), layout="constrained")
     drawn = ax.imshow(data[:, middle].T, origin="lower", extent=extent, cmap=colours)
     ax.contour(image.data[:, middle].T, [25], extent=extent, colors="w", linewidths=1)
     figure.colorbar(drawn, ax=ax, label=title, shrink=0.85)

@@ -44,14 +44,14 @@ remaining = tetopt.E_D(image, after) / tetopt.E_D(image, before)
 print(f"{remaining:.2f} of what pytetwild's cells left")
 
 # %%
-# Both meshes, cut open: on the left, cells cross the spheres' surfaces; on the right, they follow them.
+# Both meshes, cut open: in the first, cells cross the spheres' surfaces; in the second, they follow them.
 
-plotter = pyvista.Plotter(shape=(1, 2), window_size=(1300, 560), border=False)
-for column, mesh in enumerate((before, after)):
-    plotter.subplot(0, column)
+# sphinx_gallery_thumbnail_number = 2
+for mesh in (before, after):
+    plotter = pyvista.Plotter(window_size=(650, 560))
     plotter.set_background("#171a21")
     half = mesh.to_pyvista({"mean": tetopt.cell_moments(image, mesh).mean}).clip("y", crinkle=True)
     plotter.add_mesh(half, cmap="RdYlBu_r", show_edges=True, edge_color="#20242c", show_scalar_bar=False, ambient=0.2)
     plotter.view_vector((0.15, 1.0, 0.25), viewup=(0, 0, 1))
     plotter.camera.zoom(1.3)
-plotter.show()
+    plotter.show()

@@ -40,8 +40,9 @@ print(f"k_D = 0.85 leaves {gain:.1%} less than k_D = 0.2")
 # %%
 # The four meshes.
 
-figure, axes = plt.subplots(2, 2, figsize=(9, 9), layout="constrained")
-for ax, weight, mesh, fraction, rho in zip(axes.flat, weights, meshes, fractions, shapes, strict=True):
+# sphinx_gallery_thumbnail_number = 3
+for weight, mesh, fraction, rho in zip(weights, meshes, fractions, shapes, strict=True):
+    figure, ax = plt.subplots(figsize=(4.5, 4.5), layout="constrained")
     means = tetopt.cell_moments(image, mesh).mean
     ax.tripcolor(*mesh.points.T, mesh.cells, means, cmap="bone", edgecolors="#c2622d", linewidth=0.4)
     ax.set_aspect("equal")

@@ -60,9 +60,9 @@ print(f"fluid: {of_voxels.p50:.2f} mm of voxels, {of_cells.p50:.2f} mm of cells"
 # Both meshes, cut in the middle: without sizes, and two cells across.
 
 COLOURS = {1: "#c9867b", 2: "#3f7fbf", 3: "#f4ead5", 4: "#566072"}
-plotter = pyvista.Plotter(shape=(1, 2), window_size=(1000, 520))
-for column, result in enumerate((without, sized)):
-    plotter.subplot(0, column)
+# sphinx_gallery_thumbnail_number = 2
+for result in (without, sized):
+    plotter = pyvista.Plotter(window_size=(600, 600))
     plotter.set_background("#171a21")
     half = result.mesh.to_pyvista({"label": result.labels}).clip("y", origin=(18, 18, 18), crinkle=True)
     for label, colour in COLOURS.items():
@@ -70,4 +70,4 @@ for column, result in enumerate((without, sized)):
         plotter.add_mesh(cells, color=colour, show_edges=True, edge_color="#2b2326", line_width=0.7, ambient=0.25)
     plotter.view_vector((0.0, 1.0, 0.0), viewup=(0, 0, 1))
     plotter.camera.zoom(1.3)
-plotter.show()
+    plotter.show()

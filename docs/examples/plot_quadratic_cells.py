@@ -51,7 +51,7 @@ print(f"{nodes[0]} nodes: the error of quadratic cells is {factor:.2f} times sma
 # %%
 # The errors, and the stress of quadratic elements on the mesh of 480 nodes.
 
-figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.8), layout="constrained")
+figure, left = plt.subplots(figsize=(5.2, 4.8), layout="constrained")
 for order, name, colour in ((1, "linear", "#2f6db5"), (2, "quadratic", "#d95f02")):
     left.loglog(unknowns[order], errors[order], "o-", color=colour, label=f"{name} cells")
 left.set_xticks([200, 500, 1000, 2000], ["200", "500", "1000", "2000"])
@@ -60,6 +60,7 @@ left.set(xlabel="unknowns", ylabel="relative error of the strain energy")
 left.legend()
 mesh = meshes[3]
 stress = tetopt.solution_fields(mesh, solution(mesh, 2)).cell_data["von_mises"]
+figure, right = plt.subplots(figsize=(5.2, 4.8), layout="constrained")
 drawn = right.tripcolor(*mesh.points.T, mesh.cells, stress, cmap="inferno", edgecolors="#404a5a", linewidth=0.2)
 right.set_aspect("equal")
 right.axis("off")

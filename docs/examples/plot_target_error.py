@@ -24,7 +24,7 @@ image = tetopt.Image(template.get_fdata()[:, :, k], template.affine[np.ix_([0, 1
 
 
 def fraction(mesh):
-    """Fraction of the image's variance that is left inside the cells."""
+    """Return the unexplained fraction of the image's variance."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
@@ -43,15 +43,16 @@ print(f"{needed} nodes leave {fraction(result.mesh):.4f}, 0.03 at most as was as
 # %%
 # The mesh with an error of 0.03, and its place on the curve.
 
-figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5), layout="constrained", width_ratios=[1, 1.1])
+figure, left = plt.subplots(figsize=(5, 5), layout="constrained")
 means = tetopt.cell_moments(image, result.mesh).mean
 left.tripcolor(*result.mesh.points.T, result.mesh.cells, means, cmap="gray", edgecolors="#2f6db5", linewidth=0.25)
 left.set_aspect("equal")
 left.axis("off")
 left.set_title(f"{needed} nodes")
+figure, right = plt.subplots(figsize=(5, 5), layout="constrained")
 right.loglog(numbers, errors, "o-", color="#2f6db5", label="mesh_image(image, nodes=...)")
 right.loglog([needed], [fraction(result.mesh)], "*", color="#d95f02", markersize=16, label="target_error=0.03")
 right.axhline(0.03, color="#d95f02", linewidth=0.8)
-right.set(xlabel="nodes", ylabel="fraction of the variance left inside cells")
+right.set(xlabel="nodes", ylabel="fraction of variance unexplained")
 right.legend()
 plt.show()

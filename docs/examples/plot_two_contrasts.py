@@ -32,7 +32,7 @@ meshes = {
 
 
 def fraction(image, mesh):
-    """Fraction of the image's variance that is left inside the cells."""
+    """Return the unexplained fraction of the image's variance."""
     return tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
 
 
@@ -51,10 +51,11 @@ print(f"at most {worst:.4f} is left of either contrast")
 # %%
 # Cell means of the first contrast (top) and the second (bottom).
 
-figure, axes = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")
-for column, (name, mesh) in zip(axes.T, meshes.items(), strict=True):
-    column[0].set_title(f"mesh {name}")
-    for ax, image, colours in zip(column, (first, second), ("gray", "magma"), strict=True):
+# sphinx_gallery_thumbnail_number = 5
+for name, mesh in meshes.items():
+    for shown, image, colours in (("first", first, "gray"), ("second", second, "magma")):
+        figure, ax = plt.subplots(figsize=(4.4, 4.4), layout="constrained")
+        ax.set_title(f"mesh {name}, {shown} image")
         means = tetopt.cell_moments(image, mesh).mean
         ax.tripcolor(*mesh.points.T, mesh.cells, means, cmap=colours, edgecolors="#7f8fa6", linewidth=0.4)
         ax.set_aspect("equal")

@@ -85,14 +85,14 @@ def mesh_image(
     nodes: int | None = None,
     *,
     target_error: float | None = None,
+    sizes: Sizes | None = None,
+    order: int = 1,
     mode: Mode | None = None,
     start: Mesh | None = None,
     spacing: float | None = None,
     kind: str | None = None,
     k_D: float | None = None,
     iterations: int | None = None,
-    sizes: Sizes | None = None,
-    order: int = 1,
     watch: Callable[[Mesh, Run], MeshingResult] | None = None,
     **options: Any,
 ) -> MeshingResult:
@@ -110,6 +110,13 @@ def mesh_image(
     target_error : float
         Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0 to 1. A few runs find
         the required number of nodes. `violated` reports a run that ends above the target.
+    sizes : Sizes
+        Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
+        order 2 up to 1.15 times with a gradation of 0.5.
+    order : {1, 2}
+        Intended order of the cells (`tetopt.geometry.quadratic`). With 2, `nodes` includes mid-edge nodes: about a
+        seventh of the nodes are corners (a quarter in 2-D), whose number takes up to three runs to find. With a mask or
+        smooth labels, the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (see `curving`).
     mode : {"graded", "uniform", "paper", "start"}
         "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`,
         clipped at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`, for a single image without
@@ -126,13 +133,6 @@ def mesh_image(
         larger weights than on a uniform mesh are usual.
     iterations : int
         As for `optimize`, by default 16 for a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
-    sizes : Sizes
-        Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
-        order 2 up to 1.15 times with a gradation of 0.5.
-    order : {1, 2}
-        Intended order of the cells (`tetopt.geometry.quadratic`). With 2, `nodes` includes mid-edge nodes: about a
-        seventh of the nodes are corners (a quarter in 2-D), whose number takes up to three runs to find. With a mask or
-        smooth labels, the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (see `curving`).
     watch : callable
         Called for each run with its initial mesh and a function that does the run; returns the run's result. It may
         pass a callback: `lambda initial, run: run(callback=print)`.

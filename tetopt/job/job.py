@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
-from inspect import cleandoc
 from numbers import Integral, Real
 from pathlib import Path
 from textwrap import wrap
@@ -15,13 +15,14 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tetopt.errors import InputError
-from tetopt.job.options import JobOptions, kinds_of, near_hint, option_of
+from tetopt.job.options import JobOptions, SizeOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
 from tetopt.model.mappings import MAPPED_OPTIONS
 from tetopt.system.incoming import json_of
 from tetopt.system.public import LARGEST_INTEGER
 
 Record = TypeVar("Record")
+FIRST = ("images", "output", "nodes", "mask", "labels", *kinds_of(SizeOptions))  # as users set them
 MOST_SAID = 80  # characters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar
 KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
@@ -132,10 +133,19 @@ class Job(JobOptions):
         return cls(**table)
 
 
+def _signature() -> inspect.Signature:
+    """Return the signature of a job in the order of FIRST; all options are keywords, so their order is free."""
+    plain = inspect.signature(Job)
+    parameters = plain.parameters
+    return plain.replace(parameters=[parameters[name] for name in dict.fromkeys((*FIRST, *parameters))])
+
+
 def _parameters() -> str:
     """Return the options of a job for its docstring."""
     lines = []
-    for field in fields(Job):
+    known = {field.name: field for field in fields(Job)}
+    for name in Job.__signature__.parameters:  # type: ignore[attr-defined]
+        field = known[name]
         kind = kinds_of(Job)[field.name]
         option = option_of(kind)
         words = _kind_words(get_args(kind)[0]) + UNIT_WORDS.get(option.metavar or "", "")
@@ -158,8 +168,9 @@ def _kind_words(kind: Any) -> str:
     return f"list of {_kind_words(get_args(own)[0])}" if get_origin(own) is list else own.__name__.lower()
 
 
-if Job.__doc__:  # of which Python takes the indentation off from 3.13 on
-    Job.__doc__ = cleandoc(Job.__doc__).replace("PARAMETERS", _parameters())
+Job.__signature__ = _signature()  # type: ignore[attr-defined]
+if Job.__doc__:  # Python removes its indentation from 3.13 on
+    Job.__doc__ = inspect.cleandoc(Job.__doc__).replace("PARAMETERS", _parameters())
 
 
 def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
