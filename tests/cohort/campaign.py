@@ -1,8 +1,7 @@
 """A cohort of 200 with failures put in, its client killed on the way: everything is accounted for (`make test-cohort`).
 
 python tests/cohort/campaign.py [SUBJECTS [SEED]]. Prints a table, and ends with 1 where a row of it is not as it
-should be. The last numbers are in docs/measured/cohorts.md. Failures are put in from outside: tetopt knows nothing
-of them.
+should be. Failures are put in from outside: tetopt knows nothing of them.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """What dask costs a cohort of thousands: subjects that do nothing, through the loop that runs real ones.
 
-Run by hand: python tests/cohort/overhead.py [SUBJECTS]. The last numbers are in docs/measured/cohorts.md.
+Run by hand: python tests/cohort/overhead.py [SUBJECTS].
 """
 
 import sys

@@ -151,7 +151,7 @@ def flags_of_column(column, values):
 
 @pytest.mark.parametrize("n", [8, 20, 500])
 def test_usual_numbers_are_seldom_flagged(n):
-    """At most 1 normal one of 1000, of Student's t with 5 degrees of freedom 5 of 1000; docs/measured/cohorts.md."""
+    """At most 1 normal one of 1000, of Student's t with 5 degrees of freedom 5 of 1000."""
     rng = np.random.default_rng(n)
     columns = 50_000 // n
     for numbers, most in ((rng.normal(size=(columns, n)), 1e-3), (rng.standard_t(5, size=(columns, n)), 5e-3)):

@@ -1,7 +1,7 @@
 """Runs in parts that are killed, interrupted or out of disk on dask's workers: the same bytes (`make test-parts`).
 
 python tests/parts/campaign.py [NODES [PARTS]]: the MNI152 T1 by `tetopt mesh`, 8000 nodes in 4 parts or more. Prints a
-table, and ends with 1 where a row of it is not as it should be. The last numbers are in docs/measured/blocks.md.
+table, and ends with 1 where a row of it is not as it should be.
 What goes wrong is done from outside: tetopt knows nothing of it.
 """
 

@@ -70,7 +70,7 @@ def test_E_falls_from_round_to_round(run):
 
 
 def test_a_run_in_parts_is_nearly_as_good_as_one_in_one_piece(run, one):
-    """In parts of 150 to 400 nodes a third of all nodes are shared; `docs/measured/blocks.md` has what is usual."""
+    """In parts of 150 to 400 nodes a third of all nodes are shared."""
     mesh = run[0].result.mesh
     assert run[0].result.history[-1].E_D < 1.2 * one.history[-1].E_D
     assert rho(mesh.points, mesh.cells).mean() > rho(one.mesh.points, one.mesh.cells).mean() - 0.01
@@ -97,7 +97,7 @@ def test_seams_are_not_seen(run, one, image):
 
 @pytest.mark.slow
 def test_the_mni152_brain_in_parts_is_that_of_one_piece():
-    """The bars of the issue, at 40,000 nodes in parts of 10,000; `docs/measured/blocks.md` has the numbers."""
+    """The bars of the issue, at 40,000 nodes in parts of 10,000."""
     pytest.importorskip("nilearn", reason="the MNI152 brain is in nilearn's wheel")
     numbers = compared(load_image(mni_path("t1")), 40_000, 4)
     assert numbers["nodes"] == pytest.approx(40_000, rel=0.01)
