@@ -29,9 +29,7 @@ def test_program(tmp_path, monkeypatch, capsys):
     exec(compile(program, "README.md", "exec"), names)
     first, second, third = capsys.readouterr().out.splitlines()
     assert first == "all requirements are met"
-    fraction, shape = re.fullmatch(
-        r"(\S+) of the image's variance is left inside the cells; their mean rho is (\S+)", second
-    ).groups()
+    fraction, shape = re.fullmatch(r"unexplained variance (\S+), mean rho (\S+)", second).groups()
     assert 0.0001 < float(fraction) < 0.01
     assert float(shape) > 0.24
     n_materials, error = re.fullmatch(r"(\d+) materials, their moduli off by (\S+)% in the mean", third).groups()

@@ -29,7 +29,7 @@ print(len(mesh.points), "nodes,", len(mesh.cells), "tetrahedra")
 # cells explain 99 % of the image.
 
 fraction = tetopt.E_D(image, mesh) / (image.data.var() * image.volume)
-print(f"{fraction:.5f} of the variance is left inside the cells")
+print(f"unexplained variance {fraction:.5f}")
 
 # %%
 # The mesh cut through the middle of both spheres, cells coloured by their mean. The cut is rough because it shows whole

@@ -213,7 +213,8 @@ def test_4d_file_needs_a_volume(data_dir):
 
 @pytest.mark.parametrize("k", [-1, 2])
 def test_volume_out_of_range(data_dir, k):
-    assert_refused(data_dir / "example4d.nii.gz", f"expected a volume from 0 to 1, got {k}: the file has 2 volumes", volume=k)
+    words = f"expected a volume from 0 to 1, got {k}: the file has 2 volumes"
+    assert_refused(data_dir / "example4d.nii.gz", words, volume=k)
 
 
 def test_other_volumes_are_not_read(tmp_path):

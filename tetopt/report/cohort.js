@@ -142,7 +142,7 @@ function heading(words, c, about) {
 
 function tableOf(rows) {
   const columns = [...shown].sort((a, b) => a - b);
-  const odd = element("th", { scope: "col", textContent: "what is odd" });
+  const odd = element("th", { scope: "col", textContent: "flags" });
   const heads = columns.map((c) => heading(data.columns[c].title, c, data.columns[c].about));
   const head = element("tr", {}, heading("subject", -1, "By name"), odd, ...heads, element("th", { textContent: "files" }));
   const body = rows.map((r) => {
