@@ -94,9 +94,9 @@ def run_summary(run: dict[str, Any]) -> dict[str, Any]:
         "slivers": quality["kinds"]["sliver"],
         "initial": {key: run["quality_initial"][key] for key in ("mean_rho", "p1_rho", "min_dihedral")},
         "seconds": run["seconds"]["all"],
-        "predicted_seconds": run["prediction"]["seconds"],
+        "predicted_seconds": run["prediction"].get("seconds"),
         "peak_gb": run["memory"]["peak_bytes"] / 1e9,
-        "predicted_gb": run["prediction"]["peak_bytes"] / 1e9,
+        "predicted_gb": run["prediction"].get("peak_bytes", 0.0) / 1e9,  # neither is known of a run in parts
         "mask": run.get("mask"),
         "labels": labels,
         "contacts": contacts,
@@ -291,9 +291,10 @@ def measure(name: str, paths: dict[str, str], folder: Path) -> None:
         print(f"{name}: {command}", flush=True)
         before, begin = os.times(), time.perf_counter()
         # 1 is a mesh that violates a requirement: its row names it.
-        code = subprocess.run(runnable(words), cwd=folder, stdout=subprocess.DEVNULL).returncode
+        with (folder / "log.txt").open("a") as log:
+            code = subprocess.run(runnable(words), cwd=folder, stdout=log, stderr=log).returncode
         if code not in (0, 1):
-            raise SystemExit(f"measure: {name}: exit code {code} of {shlex.join(words)}")
+            raise SystemExit(f"measure: {name}: exit code {code} of {shlex.join(words)}; see {folder / 'log.txt'}")
         after, wall = os.times(), time.perf_counter() - begin
         cpu = sum(after[2:4]) - sum(before[2:4])
         entry["commands"].append({"command": command, "wall": wall, "cpu": cpu})
