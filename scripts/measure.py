@@ -59,8 +59,7 @@ FILES = {
     "CT_LABELS": "ct_abdomen_slab_3mm_labels.nii.gz",
     "LUNG": "ct_lung_small.mha",
     "MR_SLAB": "mr_abdomen_slab_3mm.nii.gz",
-    "HIPPOCAMPUS": "hippocampus_001.nii.gz",
-    "HIPPOCAMPUS_LABELS": "hippocampus_001_label.nii.gz",
+    "HIPPOCAMPUS": "hippocampus_001_label.nii.gz",
 }
 
 
@@ -218,8 +217,7 @@ MEASUREMENTS = {
     ),
     "masks": Measurement(
         (
-            "tetopt mesh $HIPPOCAMPUS --mask $HIPPOCAMPUS_LABELS -o hippocampus.vtu --json hippocampus.json "
-            "--nodes 1500 --force",
+            "tetopt mesh $HIPPOCAMPUS --background 0 -o hippocampus.vtu --json hippocampus.json --nodes 1500 --force",
             "tetopt mesh $T1 --background 0 -o brain.vtu --json brain.json --nodes 15000 --force",
         ),
         runs,
