@@ -121,7 +121,7 @@ def comparison(folder: Path) -> dict[str, Any]:
             meshes.setdefault(result["name"], {})[order] = mesh_summary(run) | times
     sweep = [
         {"option": row["option"], "value": row["value"], "is_default": row["is_default"], "order": row["order"]}
-        | mesh_summary(row)
+        | mesh_summary(row["measured"])
         for row in report["tradeoff"]
     ]
     return {"reference": report["reference"], "meshes": meshes, "tradeoff": sweep}
