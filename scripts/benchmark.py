@@ -193,7 +193,8 @@ def labelled(path: Path, nodes: int) -> dict[str, Any]:
 def masked_start(path: Path, nodes: int) -> dict[str, Any]:
     """Measure seconds and memory of the octree within a mask and a sizing field, in its own process."""
     program = (
-        "import json, resource, sys, time, numpy as np, tetopt\n"
+        "import json, sys, time, numpy as np, tetopt\n"
+        "from tetopt.system.budget import peak_bytes\n"
         "image, mask, nodes = tetopt.load_image(sys.argv[1]), tetopt.load_image(sys.argv[2]), int(sys.argv[3])\n"
         "from tetopt.start.octree import nearest_octree\n"
         "content = tetopt.content(image, mask=mask)\n"
@@ -203,7 +204,7 @@ def masked_start(path: Path, nodes: int) -> dict[str, Any]:
         "mesh = nearest_octree(content, nodes, sizes)\n"
         "print(json.dumps({'nodes': len(mesh.points), 'wall': time.perf_counter() - begin,\n"
         "    'cpu': time.process_time() - cpu,\n"
-        "    'peak_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}))\n"
+        "    'peak_gb': peak_bytes() / 1e9}))\n"
     )
     with tempfile.TemporaryDirectory() as name:
         mask = Path(name) / "mask.nii.gz"
@@ -276,7 +277,8 @@ def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
     The image is the whole volume, or `edge`^3 voxels of it, zero-padded and cropped.
     """
     program = (
-        "import json, resource, sys, time, numpy as np, tetopt\n"
+        "import json, sys, time, numpy as np, tetopt\n"
+        "from tetopt.system.budget import peak_bytes\n"
         "image, nodes, edge = tetopt.load_image(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])\n"
         "if edge:\n"
         "    data = np.pad(image.data, [(0, max(edge - s, 0)) for s in image.shape])[:edge, :edge, :edge]\n"
@@ -290,7 +292,7 @@ def graded(path: Path, nodes: int, edge: int = 0) -> dict[str, Any]:
         "print(json.dumps({'nodes': shape.n_nodes, 'cells': shape.n_cells, 'seconds': seconds,\n"
         "    'mean_rho': shape.mean_rho, 'min_dihedral': shape.min_dihedral,\n"
         "    'E_D_fraction': tetopt.E_D(image, mesh) / variance,\n"
-        "    'peak_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}))\n"
+        "    'peak_gb': peak_bytes() / 1e9}))\n"
     )
     return _told_by(program, path, nodes, edge)
 
