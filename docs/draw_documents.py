@@ -39,8 +39,7 @@ LARGEST_WIDTH = 1400  # pixels: the column of a page on a screen of twice the us
 PICTURE_DPI = 140  # a figure of nine inches fills the column of a page on a screen of usual density
 # The pictures that other commands draw, which stand beside these.
 COMMANDS = {
-    "demo.png": "tetopt compare T1.nii.gz -o compared --nodes 15000 --pipelines tetopt-uniform,tetopt,pytetwild,"
-    " then --shrink of slices.png",
+    "demo.png": "make measured, which shrinks slices.png of its comparison",
     "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
     "organ.png": "python docs/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
     "tradeoff.png": "tetopt compare T1.nii.gz -o compared --nodes 5000 --tradeoff",

@@ -45,7 +45,7 @@ PROGRAMS = {
     "CGAL_SIZED": "the same with a sizing field",
     "CGAL_LABELS": "Python script around it, for `tetopt compare --pipeline`",
 }
-PICTURES = {"demo.png": ("mni152_15000", "compared/slices.png")}  # in docs/pictures: measurement and file
+PICTURES = {"demo.png": ("mni152", "compared/slices.png")}  # in docs/pictures: measurement and file
 
 FILES = {
     "T1": "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz",
@@ -166,13 +166,6 @@ MEASUREMENTS = {
         (
             f"tetopt compare $T1 {COMPARED} --nodes 5000 --pipelines tetopt,tetopt-uniform,pytetwild,bcc {CGAL} "
             "--reference-dofs 1000000 --tradeoff",
-        ),
-        comparison,
-    ),
-    "mni152_15000": Measurement(
-        (
-            f"tetopt compare $T1 {COMPARED} --nodes 15000 --pipelines tetopt-uniform,tetopt,pytetwild "
-            "--reference-dofs 300000",
         ),
         comparison,
     ),
@@ -301,7 +294,16 @@ def measure(name: str, paths: dict[str, str], folder: Path) -> None:
     save_json(DATA, rounded(everything | {name: entry}))
     for picture, (of, file) in PICTURES.items():
         if of == name:
-            shutil.copyfile(folder / file, ROOT / "docs" / "pictures" / picture)
+            shrink = [
+                str(ROOT / "docs" / "draw_documents.py"),
+                "-o",
+                str(folder),
+                "--force",
+                "--shrink",
+                str(folder / file),
+            ]
+            subprocess.run([sys.executable, *shrink], check=True)
+            shutil.copyfile(folder / Path(file).name, ROOT / "docs" / "pictures" / picture)
 
 
 def runnable(words: list[str]) -> list[str]:
