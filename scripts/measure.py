@@ -369,11 +369,11 @@ def about(measured: dict[str, Any], names: Sequence[str]) -> str:
 
 
 def broken(command: str) -> str:
-    """A command in lines of at most 110 characters."""
+    """A command in lines of at most 95 characters."""
     lines, line = [], ""
     for word in shlex.split(command):
         word = shlex.quote(word) if not re.fullmatch(r"[$\w./,:=-]+", word) else word
-        if len(line) + len(word) > 105:
+        if len(line) + len(word) > 90:
             lines, line = [*lines, line + " \\"], "   "
         line = f"{line} {word}" if line else word
     return "\n".join([*lines, line])
