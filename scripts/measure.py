@@ -363,9 +363,12 @@ def pages() -> dict[Path, str]:
 def about(measured: dict[str, Any], names: Sequence[str]) -> str:
     """Where the numbers of these measurements come from: a line, then their commands."""
     entries = [measured[name] for name in names]
-    stamps = {f"tetopt {e['version']} ({e['commit']}), {long_date(e['date'])}; {e['machine']}" for e in entries}
+    commits = ", ".join(dict.fromkeys(entry["commit"] for entry in entries))
+    stamps = dict.fromkeys(f"{long_date(entry['date'])}; {entry['machine']}" for entry in entries)
+    versions = ", ".join(dict.fromkeys(entry["version"] for entry in entries))
+    origin = f"Written by `make measured`: tetopt {versions} ({commits}), {'; '.join(stamps)}."
     commands = [broken(row["command"]) for entry in entries for row in entry["commands"]]
-    return "\n".join([f"Written by `make measured`: {'; '.join(sorted(stamps))}.", "", "```bash", *commands, "```"])
+    return "\n".join([origin, "", "```bash", *commands, "```"])
 
 
 def broken(command: str) -> str:
