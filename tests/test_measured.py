@@ -76,8 +76,19 @@ def test_a_measurement_replaces_its_entry(measure, tmp_path, monkeypatch):
     command = "tetopt phantom sphere --voxel-mm 8 -o $NAME"
     then = "tetopt mesh sphere.nii.gz -o sphere.vtu --nodes 60 --iterations 1 --json sphere.json --force"
     monkeypatch.setitem(measure.MEASUREMENTS, "small", measure.Measurement((command, then), measure.runs))
-    measure.measure("small", {"NAME": "sphere.nii.gz"}, tmp_path / "small")
+    for _ in range(2):  # what the first leaves is not refused, and not read
+        measure.measure("small", {"NAME": "sphere.nii.gz"}, tmp_path / "small")
+        (tmp_path / "small" / "old.json").write_text("{}", encoding="utf-8")
     entry = json.loads(measure.DATA.read_text(encoding="utf-8"))["small"]
     assert entry["version"] == tetopt.__version__
     assert [row["command"] for row in entry["commands"]] == [command, then]
     assert entry["rows"]["sphere"]["nodes"] == len(tetopt.load_mesh(tmp_path / "small" / "sphere.vtu").mesh.points)
+
+
+def test_a_failed_program_is_no_measurement(measure, tmp_path, monkeypatch):
+    """Exit code 1 is a violated requirement of `tetopt mesh` alone."""
+    monkeypatch.setattr(measure, "DATA", tmp_path / "measured.json")
+    monkeypatch.setitem(measure.MEASUREMENTS, "failed", measure.Measurement(("python -c 1/0",), measure.runs))
+    with pytest.raises(SystemExit, match="failed: exit code 1"):
+        measure.measure("failed", {}, tmp_path / "failed")
+    assert not measure.DATA.exists()
