@@ -227,6 +227,10 @@ MEASUREMENTS = {
         ),
         listed("averages.json"),
     ),
+    "curved": Measurement(
+        ("python tests/benchmarks/curved_cells.py -o curved.json $HIPPOCAMPUS",),
+        listed("curved.json"),
+    ),
     "speed": Measurement(
         ("python scripts/benchmark.py -o bench.json --cgal $CGAL --cgal-sized $CGAL_SIZED --head $HEAD --force",),
         benchmark,

@@ -197,6 +197,15 @@ def ran(folder, program, cache=None, **names):
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, cwd=folder)
 
 
+WAITING = "import os, tetopt.system.kernels; print(os.environ['OMP_WAIT_POLICY'])"
+
+
+def test_threads_wait_without_spinning(tmp_path):
+    """Unless the user wants them to: on a busy machine, spinning threads take the time of those that compute."""
+    assert ran(tmp_path, WAITING).stdout == "passive\n"
+    assert ran(tmp_path, WAITING, OMP_WAIT_POLICY="active").stdout == "active\n"
+
+
 @pytest.mark.deep
 @linked_only
 def test_processes_share_what_is_to_be_compiled(tmp_path):

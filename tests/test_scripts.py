@@ -114,6 +114,20 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     assert "exists" in capsys.readouterr().err
 
 
+def test_curved_cells(tmp_path, monkeypatch):
+    """Curved facets are nearer to the sphere, and the volume of its label to that of the voxels."""
+    module, out, labels = script("curved_cells"), tmp_path / "curved.json", tmp_path / "labels.nii.gz"
+    monkeypatch.setattr(module, "RADIUS", 8.0)
+    monkeypatch.setattr(module, "HALF", 12)
+    monkeypatch.setattr(module, "NODES", (500,))
+    monkeypatch.setattr(module, "NODES_OF_LABELS", 500)
+    tetopt.save_image(labels, module.sphere())
+    module.main([str(labels), "-o", str(out)])
+    off, volumes = json.loads(out.read_text()).values()
+    assert 2.0 * off["curved"] < off["straight"] < 1.0
+    assert 2.0 * abs(volumes["curved"][0]) < abs(volumes["straight"][0]) < 0.1
+
+
 def test_choose_average(tmp_path, monkeypatch, capsys):
     """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
