@@ -62,6 +62,18 @@ def test_what_a_run_refuses_its_prediction_does(image_path, tmp_path, capsys):
     assert exit_code(*mesh_words(tmp_path / "none.nii", tmp_path, "--predict", "--force")) == 2
     assert "no such file" in capsys.readouterr().err
     assert exit_code(*mesh_words(image_path, tmp_path, "--predict", "--force", "--k-d", "2")) == 2
+    capsys.readouterr()
+    limited = mesh_words(image_path, tmp_path, "--force", "--nodes", "60", "--edge-max", "3")
+    assert exit_code(*limited) == exit_code(*limited, "--predict") == 2
+    run, prediction = capsys.readouterr().err.split("they need at least")[1:]
+    assert run.split(";")[0] == prediction.split(";")[0]
+
+
+def test_a_target_error_with_limits_on_sizes_needs_their_nodes(image_path, tmp_path, sizes):
+    """The prediction is for the nodes of the first octree, more than the default."""
+    words = mesh_words(image_path, tmp_path, "--predict", "--target-error", "0.5", "--edge-max", "1.2")
+    assert exit_code(*words) == 0
+    assert sizes[0].n_nodes > 5_000
 
 
 def test_sizes_of_what_was_read(image_path, tmp_path, sizes):

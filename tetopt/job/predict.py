@@ -19,13 +19,17 @@ from tetopt.io.zarr_images import is_zarr
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
+from tetopt.start.octree import least_nodes
+from tetopt.start.sizes import Sizes
 
 SEARCH_RUNS = 4  # for a target error, mostly, each with about the default number of nodes
 QUADRATIC_RUNS = 2  # for a number of nodes of order 2: the second mostly reaches it
 SAMPLED_VALUES = 10_000  # of an image: if one is not a whole number, most are not
 
 
-def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | None = None) -> RunSize:
+def size_of_run(
+    plan: Plan, content: Content, whole: Image, n_started: int | None = None, sizes: Sizes | None = None
+) -> RunSize:  # fmt: skip
     """Return the sizes of a run whose files have been read.
 
     Parameters
@@ -38,12 +42,16 @@ def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | Non
         The first contrast as read.
     n_started : int, optional
         Number of corner nodes of a mesh to start from.
+    sizes : Sizes, optional
+        Sizes of cells, which may need more nodes than a target error.
     """
     nodes, spacing = plan.job.nodes, plan.job.spacing
     if nodes is None and spacing is not None:
         per_block = 1 if plan.job.lattice == "five-tet" else 2
         nodes = max(round(per_block * content.volume / spacing**content.image.ndim), 1)
     size = _size(plan, whole.shape, nodes)
+    if plan.mode == "graded" and plan.job.target_error is not None:
+        size = size._replace(n_nodes=max(size.n_nodes, round(least_nodes(content, size.n_nodes, sizes))))
     return size._replace(
         n_voxels=prod(content.image.shape),
         n_nodes=size.n_nodes if n_started is None else n_started,

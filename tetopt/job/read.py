@@ -75,7 +75,7 @@ def read_planned(plan: Plan) -> Task:
     if by_label is not None:
         tell_label_sizes(by_label, plan.job.cells_across, source.table)
     n_started = None if begun is None else len(begun.mesh.points)
-    size = size_of_run(plan, source.content, source.contrasts[0], n_started)
+    size = size_of_run(plan, source.content, source.contrasts[0], n_started, sizes)
     # With the files' current checksums.
     request = requested(changed(plan.bare, parts=plan.division.n_parts))
     return Task(plan, source, begun, sizes, size, request, by_label)

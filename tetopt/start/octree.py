@@ -115,27 +115,44 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     (303, 3.3)
     """
     content = plain(image)
-    shape = " x ".join(map(str, content.image.shape))
-    given_sizes = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
+    check_enough(content, nodes, sizes)
     limits = _block_limits(content, nodes, sizes)
-    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
-    if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
-        least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
-        if limits.target is None and enough <= prod(content.image.shape):  # count, as the bound is low
-            enough = len(_octree_within(content, nodes, limits).points)
-        raise InputError(
-            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need at least {least:.4g}; "
-            f"use {np.ceil(enough):.0f}, or allow longer edges"
-        )
     mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
     # Exchanges correct the number within a mask or with targets.
     if is_near(count, nodes) or content.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
-        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
+        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {_given(content, sizes)}: the "
         f"nearest octree found has {count}; use about as many, or a uniform mesh"
     )
+
+
+def check_enough(content: Content, nodes: int, sizes: Sizes | None) -> None:
+    """Raise InputError for fewer nodes than the sizes need, as `octree_mesh` does."""
+    limits = _block_limits(content, nodes, sizes)
+    by_target = _target_nodes(content, limits)
+    least = max(_fewest_nodes(content, limits), by_target)
+    if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
+        enough = max(least, SIZED_OVER_EQUILATERAL * by_target)
+        if limits.target is None and enough <= prod(content.image.shape):  # count, as the bound is low
+            enough = len(_octree_within(content, nodes, limits).points)
+        raise InputError(
+            f"octree: {nodes} nodes are too few for {_given(content, sizes)}: they need at least {least:.4g}; "
+            f"use {np.ceil(enough):.0f}, or allow longer edges"
+        )
+
+
+def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
+    """Lower bound of the nodes of an octree of about so many `nodes` that the sizes need."""
+    limits = _block_limits(content, nodes, sizes)
+    return max(_fewest_nodes(content, limits), _target_nodes(content, limits))
+
+
+def _given(content: Content, sizes: Sizes | None) -> str:
+    """The image and the sizes, in words."""
+    limited = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
+    return f"{' x '.join(map(str, content.image.shape))} voxels{limited}"
 
 
 class _BlockLimits(NamedTuple):
