@@ -23,7 +23,8 @@ from tetopt.system.files import check_suffix, written_whole
 
 STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right, in front and above
-GLASS_OPACITY = 0.35  # of the cells' colours over the image: colours are distinct, and voxels remain visible
+GLASS_OPACITY = 0.6  # of the cells' colours over the image: colours are distinct, and voxels remain visible
+ABOVE_IMAGE = 1e-3  # distance of the cells in a section from the image there, as a fraction of the mesh's extent
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
@@ -129,7 +130,9 @@ def opened_mesh(shown: Exhibit) -> Draw:
         if behind.n_cells:
             plotter.add_mesh(behind, ambient=0.2, **look)
         if section.n_cells:
-            plotter.add_mesh(section, lighting=False, opacity=1.0 if image is None else GLASS_OPACITY, **look)
+            # Nearer to the camera than the image, which would hide it where both are equally near.
+            glass = section.translate(ABOVE_IMAGE * np.ptp(points, axis=0).max() * plane["normal"])
+            plotter.add_mesh(glass, lighting=False, opacity=1.0 if image is None else GLASS_OPACITY, **look)
         if image is not None:
             plotter.add_mesh(
                 plane_slice(image, axis, middle[axis]), scalars="h", cmap="gray", lighting=False,
@@ -155,7 +158,7 @@ def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
         mapper = pyvista.DataSetMapper()
         mapper.lookup_table = pyvista.LookupTable(COLOUR_MAP, scalar_range=field.limits)
         plotter.add_scalar_bar(
-            title=title, mapper=mapper, color="black", fmt="%.4g", vertical=True, position_x=0.86, position_y=0.05,
+            title=title, mapper=mapper, color="black", fmt="%.4g", vertical=True, position_x=0.86, position_y=0.63,
             height=0.35, width=0.06, title_font_size=18, label_font_size=16, render=False,
         )  # fmt: skip
         return
