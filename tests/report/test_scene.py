@@ -102,6 +102,7 @@ def test_the_mesh_is_cut_across_its_middle(opengl, mesh, image):
     values = np.random.default_rng(1).normal(50.0, 20.0, len(mesh.cells))
     plotter, (behind, section, sheet) = drawn(exhibit(mesh, {"mean": values}, image))
     axis, middle = int(np.argmin(np.ptp(mesh.points, axis=0))), (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    # Of two parts equally near to the camera, rounding decides which is seen.
     above = section.points[:, axis] - middle[axis]
     assert 0.0 < above.min() <= above.max() < 2e-3 * np.ptp(mesh.points, axis=0).max()
     assert section.area == pytest.approx(section_area(mesh.points, mesh.cells, axis, middle[axis]), rel=1e-5)
@@ -151,16 +152,6 @@ def test_a_picture_is_in_the_colours_asked_for(opengl, mesh, tmp_path):
         middle = pixels[2 * height // 5 : 3 * height // 5, 2 * width // 5 : 3 * width // 5]
         bright.append(np.median(middle[..., 1]))
     assert bright[0] < 80 < 150 < bright[1]  # viridis runs from dark violet to yellow
-
-
-def test_cells_are_seen_over_the_image(opengl, mesh, image, tmp_path):
-    """Yellow cells make the cut yellow, which without them is as grey as the image."""
-    save_scenes(tmp_path / "a.png", [("", opened_mesh(exhibit(mesh, {"mean": np.full(len(mesh.cells), 50.0)}, image)))])
-    with PIL.Image.open(tmp_path / "a.png") as picture:
-        pixels = np.asarray(picture.convert("RGB")).astype(int)
-    height, width = pixels.shape[:2]
-    middle = pixels[2 * height // 5 : height // 2, 2 * width // 5 : 3 * width // 5].reshape(-1, 3)
-    assert np.median(np.ptp(middle, axis=1)) > 30
 
 
 def test_hostile_names_are_drawn_letter_by_letter(opengl, mesh, tmp_path, capfd):
