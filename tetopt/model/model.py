@@ -290,7 +290,7 @@ def locking_words(model: Model) -> str:
         return ""
     return (
         f"nu = {largest:g}: linear elements are too stiff near incompressibility; use quadratic elements (order 2), or "
-        "choose them in the solver (docs/understand/order.md)"
+        "choose them in the solver"
     )
 
 
