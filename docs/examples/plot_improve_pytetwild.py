@@ -38,7 +38,7 @@ for name, mesh in (("pytetwild's", before), ("improved", after)):
     print(f"{name:11}: {len(mesh.points)} nodes, {fraction:.4f} left, angles from {shape.min_dihedral:.1f} degrees")
 
 # %%
-# With the same boundary nodes and as many inner nodes, a good quarter of the variance inside the cells remains.
+# With the same boundary nodes and as many inner nodes, a good quarter of the unexplained variance remains.
 
 remaining = tetopt.E_D(image, after) / tetopt.E_D(image, before)
 print(f"{remaining:.2f} of what pytetwild's cells left")

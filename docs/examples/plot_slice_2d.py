@@ -20,7 +20,7 @@ shape_alone = tetopt.optimize_paper(image, start, k_D=0.0, iterations=15).mesh
 aligned = tetopt.optimize_paper(image, start, k_D=0.5, iterations=15).mesh
 
 # %%
-# Optimising shape alone leaves the variance inside the cells unchanged. With the image, most of it disappears, with the
+# Optimising shape alone leaves the unexplained variance unchanged. With the image, most of it disappears, with the
 # same number of nodes.
 
 

@@ -87,7 +87,7 @@ def workers(
 
 
 def check_choice(count: int | None, scheduler: str | None, cluster: Path | None, extra: str) -> None:
-    """Raise InputError for what `workers` refuses at once; call it before images are read and anything is written.
+    """Raise InputError for what `workers` rejects at once; call it before images are read and anything is written.
 
     A scheduler is contacted, for `CONNECT_SECONDS` at most. `extra` is tetopt's extra that installs the caller's
     dependencies: "cohort" or "blocks".

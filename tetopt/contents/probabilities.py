@@ -214,7 +214,7 @@ def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[n
 
 
 def _crossing(lead: NDArray[np.float32], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float32]:
-    """The step from each voxel's centre along an axis, either way, to the zero of the lead; infinite beyond 1."""
+    """Distance along an axis, in either direction, from each voxel's centre to the lead's zero; infinite beyond 1."""
     step = np.full(inside.shape, np.inf, dtype=np.float32)
     along, own, side = (np.moveaxis(each, axis, 0) for each in (step, lead, inside))
     is_crossed = side[1:] != side[:-1]

@@ -103,7 +103,7 @@ def calibrated_speed() -> float:
 
 
 def calibration() -> float:
-    """CPU time in seconds of a fixed piece of the engine's work, on one thread: voxels summed and cells measured."""
+    """CPU time, in seconds, of a fixed sample of the engine's work on one thread: summing voxels, measuring cells."""
     import numba  # imported late: predictions for another machine need no kernels
     import numpy as np
 

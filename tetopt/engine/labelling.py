@@ -479,7 +479,7 @@ def _is_disc(
             continue
         if (labels[other] == label) == is_of:
             return False
-        for k in range(n):  # the outside, beyond a facet that has all of S, too
+        for k in range(n):  # also the outside, beyond a facet that contains all of S
             if not is_of and across[other, k] < 0 and not _is_opposite(cells, other, k, cell, is_shared):
                 return False
     # The cell's own boundary facets are shared already: none of them contains all of S.

@@ -10,8 +10,8 @@ from tetopt.engine.complex import NodeStars, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
 
-NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels this near to 0 lies on all of them
-CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there
+NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place whose levels are this close to 0 lies on all of them
+CURVE_STEP_VOXELS = 0.7  # longest step towards such a place, where levels bend
 CURVE_STEPS = 16  # at most, onto a curve or a point
 NEWTON_STEPS = 6  # at most, onto the surface
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node

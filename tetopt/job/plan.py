@@ -1,4 +1,4 @@
-"""Planning of a run: contradictions are refused and defaults filled in, only here."""
+"""Planning of a run: contradictions are rejected and defaults filled in, only here."""
 
 from __future__ import annotations
 

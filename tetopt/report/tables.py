@@ -65,7 +65,7 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jaco
         ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
         ("edges, shortest, mm", lambda q: f"{q.min_edge:.4g}"),
         ("edges, longest, mm", lambda q: f"{q.max_edge:.4g}"),
-        ("cells under 10 degrees", lambda q: str(q.n_under_10_degrees)),
+        ("cells below 10 degrees", lambda q: str(q.n_under_10_degrees)),
         *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
     ]
     for name, text in rows:

@@ -184,7 +184,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     target = None
     if sizes.has_target:
         check_in_memory(
-            image, "sizes: largest and field require the voxels",
+            image, "sizes: largest and field require the voxels in memory",
             "use smallest, longest, coarsest and gradation, or crop it",
         )  # fmt: skip
         target = _target(image, sizes)
