@@ -73,7 +73,7 @@ def found(path, model):
     if suffix == ".xdmf":
         parts = grids(path.read_bytes())
         points, cells = (item(parts["mesh"].find(f"{each}/DataItem")) for each in ("Geometry", "Topology"))
-        return len(points), len(cells), named(parts["facets"]), named(parts["cells"])
+        return len(points), len(cells), *(named(parts[each]) if each in parts else () for each in ("facets", "cells"))
     if suffix == ".mfem":
         mfem = Mfem(path.read_bytes())
         return len(mfem.points), len(mfem.cells), mfem.facet_sets, mfem.cell_sets
