@@ -97,7 +97,7 @@ def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "150 nodes, " in printed
     assert "checked: conforming, oriented, in one piece, fills the box" in printed
-    assert "fraction of the variance in cells: 0." in printed
+    assert "unexplained variance: 0." in printed
     written = {path.name for path in tmp_path.iterdir()} - {"T1.nii.gz"}
     pictures = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert written == {"brain.vtu", "brain_too.vtu", "brain_job.inp", "run.json", "look.html"} | pictures

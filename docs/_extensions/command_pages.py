@@ -187,7 +187,7 @@ def _panels(name: str) -> list[str]:
 
 
 def summary(name: str) -> str:
-    """A command in one line."""
+    """Return a command as one line."""
     return help_line(name) if name in COMMANDS else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
 
 

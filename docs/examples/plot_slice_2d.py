@@ -20,8 +20,8 @@ shape_alone = tetopt.optimize_paper(image, start, k_D=0.0, iterations=15).mesh
 aligned = tetopt.optimize_paper(image, start, k_D=0.5, iterations=15).mesh
 
 # %%
-# Optimising shape alone leaves the variance inside the cells unchanged. With the image, most of it disappears, with the
-# same number of nodes.
+# Optimising shape alone does not reduce the unexplained variance. With the image, most of it disappears, with the same
+# number of nodes.
 
 
 def fraction(mesh):
@@ -31,7 +31,7 @@ def fraction(mesh):
 
 print(f"lattice {fraction(start):.3f}, shape alone {fraction(shape_alone):.3f}, aligned {fraction(aligned):.3f}")
 left_of_lattice = fraction(aligned) / fraction(start)
-print(f"the aligned mesh leaves {left_of_lattice:.3f} of what the lattice leaves")
+print(f"the aligned mesh leaves {left_of_lattice:.3f} times the unexplained variance of the lattice")
 
 # %%
 # The image on the three meshes.

@@ -126,7 +126,7 @@ def failing(folder, error, name):
         (
             MemoryError(),
             InputError,
-            r"^p.1: needs more memory than a worker may use, 0.8 GB including its own \(an alloc",
+            r"^p.1: exceeds a worker's memory limit of 0.8 GB, which includes its own use \(an alloc",
         ),
     ],
 )
@@ -148,7 +148,7 @@ def test_more_memory_than_a_worker_may_take_is_refused_where_it_is_asked_for(run
     """In a line that names the limit, and the worker goes on."""
     before = set(crew.client.nthreads())
     with pytest.raises(
-        InputError, match=r"^p: needs more memory than a worker may use, 0.8 GB including its own \(Unable to"
+        InputError, match=r"^p: exceeds a worker's memory limit of 0.8 GB, which includes its own use \(Unable to"
     ):
         run(partial(asking, tmp_path), ["p"])
     assert before <= set(crew.client.nthreads())
@@ -168,7 +168,7 @@ def filling(folder, name):
 @pytest.mark.deep
 def test_a_worker_over_its_limit_is_ended_by_its_nanny_and_the_limit_named(run, tmp_path):
     with pytest.raises(
-        InputError, match=r"^p: needs more memory than a worker may use, 0.8 GB including its own; give"
+        InputError, match=r"^p: exceeds a worker's memory limit of 0.8 GB, which includes its own use; give"
     ):
         run(partial(filling, tmp_path), ["p"], attempts=1)
     assert len(list(tmp_path.iterdir())) == 1

@@ -278,9 +278,9 @@ def written(folder, text):
         ("jobqueue: {slurm: {cores: 0}}", "cores: expected a whole number above 0"),
         ("jobqueue: {slurm: {processes: true}}", "processes: expected a whole number above 0"),
         ("jobqueue: {slurm: {cores: .inf}}", "cores: expected a whole number above 0, got inf"),
-        ("jobqueue: {slurm: {memory: lots}}", 'memory: expected memory, as "8 GB", got lots'),
-        ("jobqueue: {slurm: {memory: .inf}}", 'memory: expected memory, as "8 GB", got inf'),
-        ("jobqueue: {slurm: {memory: 1e400 GB}}", 'memory: expected memory, as "8 GB", got 1e400 GB'),
+        ("jobqueue: {slurm: {memory: lots}}", 'memory: expected a memory size such as "8 GB", got lots'),
+        ("jobqueue: {slurm: {memory: .inf}}", 'memory: expected a memory size such as "8 GB", got inf'),
+        ("jobqueue: {slurm: {memory: 1e400 GB}}", 'memory: expected a memory size such as "8 GB", got 1e400 GB'),
         (
             "jobqueue: {slurm: {job-script-prologue: module load python}}",
             "job-script-prologue: expected a list of texts",
@@ -417,7 +417,7 @@ def batch(tmp_path, monkeypatch):
 def test_a_cluster_that_takes_no_job_is_refused(batch, folders, tmp_path, capfd):
     batch("sbatch", "echo no such partition >&2; exit 1")
     path = written(tmp_path, "jobqueue: {slurm: {}}")
-    with pytest.raises(InputError, match=r"the batch system refuses jobs: no such partition$"):
+    with pytest.raises(InputError, match=r"the batch system rejects jobs: no such partition$"):
         running(Need(9, 1.0, None), folders, count=2, cluster=path).__enter__()
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")
@@ -498,7 +498,7 @@ def test_a_cluster_whose_commands_are_not_there_is_refused(folders, tmp_path, mo
 def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
     batch("sbatch", "exit 1")
     spaced = Folders(tmp_path / "my work", tmp_path)
-    with pytest.raises(InputError, match="expected an output folder with only letters"):
+    with pytest.raises(InputError, match="expected a path with only letters"):
         running(Need(9, 1.0, None), spaced, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
 
 

@@ -262,7 +262,7 @@ ITK_BOMBS = {
     "huge.mha": (mha(sizes="32767 32767 32767"), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
     "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "announces 32767 x"),
     "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "announces 3 x 4 x 5 voxels, 6e.10 bytes"),
-    "type.mha": (mha(kind="MET_OTHER"), "voxels of type MET_OTHER"),
+    "type.mha": (mha(kind="MET_OTHER"), "voxel type MET_OTHER"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
     "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),

@@ -104,7 +104,7 @@ def test_missing_package(monkeypatch):
     with pytest.raises(NotInstalled, match=r"pytetwild: not installed; .* pip install"):
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     monkeypatch.setattr(tetwild.importlib, "import_module", lambda name: __import__("tetopt_has_no_such_package"))
-    with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable \(No module .* pip install") as error:
+    with pytest.raises(tetopt.InputError, match=r"pytetwild: import failed \(No module .* pip install") as error:
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     assert not isinstance(error.value, NotInstalled)
 

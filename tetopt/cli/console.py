@@ -179,7 +179,7 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> N
         out.print(escape(sizes_in_words(measured["edges_over_target"])))
     for row in measured.get("contrasts", []):
         fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
-        out.print(escape(f"{row['image']}: weight {row['weight']:g}, fraction of its variance within cells {fraction}"))
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, unexplained variance {fraction}"))
     if "mask" in measured:
         print_wide(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:

@@ -41,7 +41,7 @@ JOBS_AT_ONCE = 20  # without `workers`: other users wait for these cores
 JOB_CORES = 4  # of a job, unless its file or `threads` sets them
 QUEUE_SECONDS = 5.0  # between two checks of jobs: a scheduler starts them no faster
 IDLE_SECONDS = 60.0  # without waiting tasks, after which idle jobs are released
-AGAIN_SECONDS = 60.0  # between a refused job, if others were accepted, and the next submission
+AGAIN_SECONDS = 60.0  # between a rejected job, if others were accepted, and the next submission
 MOST_LOST = 3  # consecutive jobs that ended before their worker came: further ones would, too
 # Keys that dask-jobqueue still accepts under old names, with a warning.
 OLD_KEYS = {"extra", "job-extra", "env-extra"}
@@ -68,7 +68,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     Raises
     ------
     InputError
-        As `configuration` and `request`; the system's commands are missing; it refuses the first job; from `slots`:
+        As `configuration` and `request`; the system's commands are missing; it rejects the first job; from `slots`:
         jobs end before their worker starts.
     """
     import dask
@@ -82,8 +82,8 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     for folder in folders:
         if not PLAIN_PATH.fullmatch(str(folder)):
             raise InputError(
-                f"{folder}: expected an output folder with only letters, digits and ./+@=:,-_ for `cluster`, "
-                "as in directives of jobs"
+                f"{folder}: expected a path with only letters, digits and ./+@=:,-_ (`cluster` writes it into job "
+                "directives); choose another output folder"
             )
     # Its own keys override the user's configuration of dask.
     stack.enter_context(
@@ -98,7 +98,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     client.register_plugin(beginning(need.is_within))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)
-    with _refused("`cluster`: the batch system refuses jobs"):
+    with _refused("`cluster`: the batch system rejects jobs"):
         cluster.sync(_first, cluster)
     n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_tasks // job.processes))
     jobs = cluster.adapt(
@@ -138,7 +138,7 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
     systems = table.get("jobqueue") if isinstance(table, dict) and set(table) == {"jobqueue"} else None
     if not isinstance(systems, dict) or len(systems) != 1:
         raise InputError(
-            f"{path}: expected one batch system, as jobqueue: {{slurm: {{queue: long, walltime: '12:00:00'}}}}"
+            f"{path}: expected one batch system, such as jobqueue: {{slurm: {{queue: long, walltime: '12:00:00'}}}}"
         )
     kind, raw = next(iter(systems.items()))
     kinds = _kinds()
@@ -211,13 +211,13 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
     Raises
     ------
     InputError
-        dask-jobqueue refuses its configuration.
+        dask-jobqueue rejects its configuration.
     """
     import dask
 
     cls = _kinds()[kind]
     settings = dask.config.get(f"jobqueue.{kind}")
-    with _refused(f"{path}: {kind}: dask-jobqueue refuses it"):
+    with _refused(f"{path}: {kind}: dask-jobqueue rejects it"):
         cluster = cls(
             job_cls=_watched(cls.job_cls, folder, [*job.exports, *settings["job-script-prologue"]]),
             security=True,
@@ -243,7 +243,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
 
 
 def _watched(job_cls: Any, folder: Path, prologue: list[str]) -> Any:
-    """Return a class of jobs that records refused and ended jobs."""
+    """Return a class of jobs that records rejected and ended jobs."""
     from distributed.core import Status
 
     class Watched(job_cls):
@@ -255,7 +255,7 @@ def _watched(job_cls: Any, folder: Path, prologue: list[str]) -> Any:
             super().__init__(*arguments, name=name, job_script_prologue=lines, **names)
 
         def is_over(self) -> bool:
-            """Return whether it has ended; a refused job ends after a while, when the system may accept another."""
+            """Return whether it has ended; a rejected job ends after a while, when the system may accept another."""
             is_refused = self.status == Status.failed
             return time.monotonic() - self.begun_at > AGAIN_SECONDS if is_refused else self.ended.exists()
 
@@ -315,7 +315,7 @@ def _demand(newcomers: Newcomers, logs: Path) -> Any:
 
 
 async def _first(cluster: Any) -> None:
-    """Submit one job, as `scale` does not report refused jobs."""
+    """Submit one job, as `scale` does not report rejected jobs."""
     cluster.worker_spec.update(cluster.new_worker_spec())
     await cluster
 
@@ -389,7 +389,7 @@ def _bytes_of(what: str, value: Any) -> float:
     except (ValueError, OverflowError):
         n_bytes = -1.0
     if not n_bytes > 0.0:
-        raise InputError(f'{what}: expected memory, as "8 GB", got {_short(value)}')
+        raise InputError(f'{what}: expected a memory size such as "8 GB", got {_short(value)}')
     return n_bytes
 
 

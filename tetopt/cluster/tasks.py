@@ -187,7 +187,7 @@ def limit_threads(number: int) -> None:
 
 
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:
-    """Raise the error of a task, in one line if the user can fix it."""
+    """Raise the error of a task, with a one-line message if the user can fix it."""
     what = plain(str(name))
     limit = memory_words(workers.limit) if workers.limit < float("inf") else "all there is"
     advice = "give workers more memory, or make the tasks smaller"
@@ -196,13 +196,13 @@ def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> 
         last = getattr(getattr(error, "last_worker", None), "address", None)
         if last in ended_at_limit:
             raise InputError(
-                f"{what}: needs more memory than a worker may use, {limit} including its own; {advice}"
+                f"{what}: exceeds a worker's memory limit of {limit}, which includes its own use; {advice}"
             ) from error
         raise InputError(f"{what}: {lost_words(attempts)}; {advice}") from error
     if isinstance(error, MemoryError):
         reason = plain(" ".join(str(error).split())) or "an allocation failed"
         raise InputError(
-            f"{what}: needs more memory than a worker may use, {limit} including its own ({reason}); {advice}"
+            f"{what}: exceeds a worker's memory limit of {limit}, which includes its own use ({reason}); {advice}"
         ) from error
     if isinstance(error, OSError) and error.errno in FULL_NUMBERS:
         raise InputError(f"{what}: {plain(str(error))}; free some space, and run this again") from error

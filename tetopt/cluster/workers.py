@@ -87,7 +87,7 @@ def workers(
 
 
 def check_choice(count: int | None, scheduler: str | None, cluster: Path | None, extra: str) -> None:
-    """Raise InputError for what `workers` refuses at once; call it before images are read and anything is written.
+    """Raise InputError for what `workers` rejects at once; call it before images are read and anything is written.
 
     A scheduler is contacted, for `CONNECT_SECONDS` at most. `extra` is tetopt's extra that installs the caller's
     dependencies: "cohort" or "blocks".
@@ -195,7 +195,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     from distributed import Client
 
     with _answering(address), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on different versions: relevant ones are checked, in one line
+        warnings.simplefilter("ignore")  # on different versions: relevant ones are checked with one message
         client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)

@@ -127,7 +127,7 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
 
 
 def _reason(log: Path, code: int) -> str:
-    """Return why a run ended, in one line: the last error line, or else the last line."""
+    """Return the reason why a run ended: the last error line, or else the last line."""
     text = log.read_text(encoding="utf-8", errors="replace")
     errors = [
         line.removeprefix(ERROR_MARK)

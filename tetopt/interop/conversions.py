@@ -38,7 +38,7 @@ LAGRANGE_KINDS = {
     "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
     "lagrange_tetrahedron 10": "quadratic_tetra",
 }  # fmt: skip
-# Nodes per cell of the types with a fixed number; pyvista's other types are missing here and are refused by name.
+# Nodes per cell of the types with a fixed number; pyvista's other types are missing here and are rejected by name.
 NODES_OF_KIND = {
     "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
     "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
@@ -123,7 +123,7 @@ def simplices_of(
         raise InputError("a triangle mesh must lie in the plane z = 0; surfaces in space are not supported")
     used, compact = np.unique(cells, return_inverse=True)
     corners, compact = points[used, :n], compact.reshape(cells.shape)
-    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses with a message
+    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh rejects with a message
         turned = oriented(corners, compact)
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
 

@@ -2,7 +2,7 @@
 
 The child is ``python -P -m tetopt.io.apart``: it gets its job by standard input and returns arrays by standard output,
 as a line of JSON and their bytes, so that nothing is executed here (no pickle). Its memory is limited (RLIMIT_AS), so
-that excessive sizes in a header are refused and not allocated; its time is limited, too. It costs a third of a second,
+that excessive sizes in a header are rejected and not allocated; its time is limited, too. It costs a third of a second,
 most of it for loading the library, which the parent then need not load.
 """
 

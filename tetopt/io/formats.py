@@ -74,7 +74,7 @@ def register_format(
     what : str
         Name of the format, for messages.
     has_quadratic : bool
-        True if it supports models of order 2; otherwise they are refused, or written with linear cells.
+        True if it supports models of order 2; otherwise they are rejected, or written with linear cells.
     runs : bool
         True if loads become a step that the solver runs; otherwise the command notes that they are only text.
     has_node_moduli : bool

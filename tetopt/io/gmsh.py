@@ -22,7 +22,7 @@ the materials instead of cell data of these names, and each cell set as 0 and 1.
 they belong to, because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns
 are vectors, by which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
 
-More than 1000 materials are only views, not groups; in 2.2 they are refused.
+More than 1000 materials are only views, not groups; in 2.2 they are rejected.
 
 The $Comments also contain coordinates, units, each material's constants, and the loads, for which MSH has no place.
 tetopt's own reader uses them, see `own_comments`.

@@ -108,9 +108,9 @@ def load_image(
     Raises
     ------
     InputError
-        ``"<path>: ..."`` in one line: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
+        ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
         SimpleITK is needed and not installed; a folder has no DICOM series, several, or uneven slices; `open_stored`
-        refuses a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
+        rejects a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
         invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
 
     Warns
@@ -185,7 +185,7 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
             if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
                 return None
             if (other := irregular(path)) is not None:
-                raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
+                raise InputError(f"expected a regular file, got {other}; copy its output into a file")
             if name.endswith(HEADED_SUFFIXES):
                 return header_sizes(path)
             _checked_head(path, name.endswith((".gz", ".mgz")))
@@ -401,7 +401,7 @@ def image_files(path: Path) -> list[Path]:
         With the path: it is neither a regular file nor a folder.
     """
     if (other := irregular(path)) not in (None, "a folder"):
-        raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
+        raise InputError(f"{path}: expected a regular file, got {other}; copy its output into a file")
     # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     if path.name.lower().endswith(HEADED_SUFFIXES):
@@ -427,7 +427,7 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
         files |= {(Path(folder) / name).relative_to(path).as_posix(): Path(folder) / name for name in names}
     for name, file in sorted(files.items()):
         if (other := irregular(file)) is not None:
-            raise InputError(f"{file}: expected a regular file, got {other}; copy what it gives into a file")
+            raise InputError(f"{file}: expected a regular file, got {other}; copy its output into a file")
         status = file.stat()
         digest.update(f"{name}\0{status.st_size}\0".encode("utf-8", "surrogateescape"))
         if is_read(file):
@@ -467,7 +467,7 @@ def check_beginning(path: Path) -> str:
     """Return the file's name in lower case; InputError if its first bytes do not fit the format."""
     with os_errors_named():
         if (other := irregular(path)) is not None:
-            raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
+            raise InputError(f"expected a regular file, got {other}; copy its output into a file")
         with path.open("rb") as stream:
             beginning = stream.read(BEGINNING_BYTES)
     if not beginning:

@@ -195,5 +195,5 @@ def _value_bytes(kind: str) -> int:
     name = kind[4:].replace("_", " ").lower() if kind.startswith("MET_") else kind
     name = re.sub("^(unsigned |signed |u)", "", name)
     if name not in VALUE_BYTES:
-        raise InputError(f"{UNREADABLE_FILE} (voxels of type {kind[:80]})")
+        raise InputError(f"{UNREADABLE_FILE} (voxel type {kind[:80]})")
     return VALUE_BYTES[name]

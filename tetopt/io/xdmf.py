@@ -105,7 +105,7 @@ TOPOLOGY_TYPES = {
 }  # fmt: skip
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
 TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
-TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 refuses it
+TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 rejects it
 INFORMATION_TEXT = "&lt;main/&gt;"  # meshio parses an Information's text as XML
 
 

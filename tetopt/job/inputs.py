@@ -1,4 +1,4 @@
-"""Read the files of a command; refuse or report their faults."""
+"""Read the files of a command; reject or report their faults."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Job(JobOptions):
     """
 
     def __post_init__(self) -> None:
-        """Convert values to the types of their fields, and refuse invalid ones."""
+        """Convert values to the types of their fields, and reject invalid ones."""
         for name in kinds_of(Job):
             object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
         resolved(self)

@@ -119,7 +119,7 @@ def _check_room(task: Task, initial: Mesh) -> None:
 
 
 def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
-    """Raise InputError for what the writer would refuse after the run, as far as the initial mesh shows."""
+    """Raise InputError for what the writer would reject after the run, as far as the initial mesh shows."""
     job = task.plan.job
     if not has_model(job) and job.output.suffix.lower() == ".vtu":
         return
@@ -181,7 +181,7 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     if (target := job.target_error) is not None:
         fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
         note(
-            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance within cells; "
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance unexplained; "
             f"accepted: {ERROR_REACHED * target:.4g} to {target:.4g}"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":

@@ -249,7 +249,7 @@ def model_of_file(
 def check_early(
     output: Path, solver: SolverOptions, ndim: int, low: float, build: Callable[[SolverOptions], Model]
 ) -> None:
-    """Raise InputError for what would be refused after the optimisation, as far as the initial mesh shows.
+    """Raise InputError for what would be rejected after the optimisation, as far as the initial mesh shows.
 
     `low` is the image's least intensity; `build` makes a model of the initial mesh. Requested sets, and interfaces, may
     be empty until the final mesh: of these, and of loads on them, only words and names are checked.
@@ -284,7 +284,7 @@ def check_early(
 
 
 def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
-    """Return the model with a facet and a cell in each requested set, so that a writer refuses bad names now."""
+    """Return the model with a facet and a cell in each requested set, so that a writer rejects invalid names now."""
     facets, cells = dict(model.sets.facets), dict(model.sets.cells)
     for request in requests:
         *of_cells, of_facets = request.names()
@@ -327,7 +327,7 @@ def drop_early(early: Path) -> None:
 
 
 def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:
-    """Save an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
+    """Save an optimised mesh whose file was rejected or failed, as VTU next to it, or else in a temporary folder.
 
     `build` makes the model to keep; if that also fails, the mesh alone is kept, as in `early` if that is a path.
 

@@ -1,4 +1,4 @@
-"""Planning of a run: contradictions are refused and defaults filled in, only here."""
+"""Plan a run: only this module rejects contradictions and fills in defaults."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
         raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
 
     def mapping(h: NDArray[np.float64]) -> NDArray[np.float64]:
-        with np.errstate(all="ignore"):  # undefined values are refused where the modulus is used
+        with np.errstate(all="ignore"):  # undefined values are rejected where the modulus is used
             return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
     return mapping

@@ -85,7 +85,7 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.fl
     ------
     InputError
         For the reasons of `mapped_values`; a modulus is negative or not finite. A modulus of 0 is accepted, as empty
-        space inside a cell; a cell with only such voxels is refused when the stiffness matrix is built.
+        space inside a cell; a cell with only such voxels is rejected when the stiffness matrix is built.
 
     Examples
     --------

@@ -114,7 +114,7 @@ def mesh_in_parts(
     request : PartsRequest
     folder : Path
         The work directory. It keeps all results, so that the same request resumes after any interruption, unless it is
-        refused before the first part begins.
+        rejected before the first part begins.
     known : Statistics, optional
         Statistics of the image, if a pass over it has computed them.
     volume : VolumeFile or Image, optional

@@ -7,7 +7,7 @@ round-R/part-P.npz            the input of a part of the next round
 round-R/done-P.npz            its result
 logs/                         output of dask and of a batch system's jobs
 
-`tetopt.system.work_directory` refuses all other entries.
+`tetopt.system.work_directory` rejects all other entries.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def removed(folder: Path) -> list[str]:
 def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
     """Remove a work directory without a state after an InputError, unless the yielded function was called before.
 
-    Otherwise the remains of the refused request would block the corrected one.
+    Otherwise the remains of the rejected request would block the corrected one.
     """
     is_kept = (folder / STATE_NAME).exists()
 

@@ -304,7 +304,7 @@ function drawControls() {
   const count = (status) => data.rows.filter((row) => row[STATUS] === status).length;
   const n = data.rows.filter((row) => row[FLAG_COUNT] || row[STATUS] !== "done").length;
   const kinds = STATUSES.filter(count).map((status) => [status, `${WORDS[status]} (${count(status)})`]);
-  const only = choice("Which subjects", [["all", `all (${data.rows.length})`], ["odd", `odd or failed (${n})`], ...kinds], "only");
+  const only = choice("Which subjects", [["all", `all (${data.rows.length})`], ["odd", `flagged or not done (${n})`], ...kinds], "only");
   const views = choice("How", [["table", "table"], ["pictures", "pictures"]], "view");
   const boxes = data.columns.map((column, c) => {
     const box = element("input", { type: "checkbox", checked: shown.has(c) });

@@ -178,7 +178,7 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
     """The target by voxel, mm; raise InputError if a field has none."""
     target = sizes.on_voxels(image)
     if target.min() >= NO_BOUND_MM:
-        raise InputError("field: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+        raise InputError("field: no voxel above 0 lies in the image's box; do both use the same world coordinates?")
     return target
 
 

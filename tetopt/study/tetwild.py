@@ -124,7 +124,7 @@ def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
         hint = f"install it with: {install_hint('compare', 'pytetwild')}"
         if isinstance(error, ModuleNotFoundError) and error.name == "pytetwild":
             raise NotInstalled(f"pytetwild: not installed; {hint}") from error
-        raise InputError(f"pytetwild: not usable ({error}); {hint}") from error
+        raise InputError(f"pytetwild: import failed ({error}); {hint}") from error
 
 
 def _run(

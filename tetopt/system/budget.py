@@ -1,4 +1,4 @@
-"""Available memory, and checks that refuse work which needs more of it, in one line, before the work starts.
+"""Available memory, and checks that reject work that needs more, before it starts.
 
 Limits of a process (RLIMIT_AS, RLIMIT_DATA, as `ulimit` and schedulers set them) make an allocation fail. The limits of
 a control group (containers, clusters) and of the machine kill the process without a message, so they must be checked

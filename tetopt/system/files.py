@@ -84,7 +84,7 @@ def name_files(values: Iterable[Any]) -> None:
 def results_folder(path: Path) -> Path:
     """Return `path`, created with its parents if missing; InputError for a file, or if it cannot be created.
 
-    A command that is refused afterwards leaves no empty folder.
+    A command that is rejected afterwards leaves no empty folder.
     """
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{path}: expected a folder for the results, found a file")
