@@ -259,15 +259,15 @@ ITK_BOMBS = {
     "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
     "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
     "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
-    "huge.mha": (mha(sizes="32767 32767 32767"), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
-    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "announces 32767 x"),
-    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "announces 3 x 4 x 5 voxels, 6e.10 bytes"),
+    "huge.mha": (mha(sizes="32767 32767 32767"), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
+    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "declares 32767 x"),
+    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "declares 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "voxel type MET_OTHER"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
     "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
-    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "announces 99999999999 x 9 x 9 voxels"),
-    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "announces 32767 x"),
+    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "declares 99999999999 x 9 x 9 voxels"),
+    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "declares 32767 x"),
     "long.nrrd": (nrrd(sizes="9" * 5000), "expected 3 sizes"),
 }
 
@@ -372,7 +372,7 @@ def nifti(path, shape=(3, 4, 5), offset=352.0, extension=b"\0\0\0\0", data=bytes
 @pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
 def test_nifti_bombs(tmp_path, name):
     assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
-    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13")
+    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13")
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
     refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels would begin at byte 1e.30")
     refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels would begin at byte nan")

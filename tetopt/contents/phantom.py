@@ -571,7 +571,7 @@ class PhantomVoxels:
 
 
 def phantom_folder() -> Path:
-    """Folder of the project's own phantoms: inside the installed package, or beside it in a checkout."""
+    """Folder of the project's own phantoms: inside the installed package, or next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "phantoms"
     return inside if inside.is_dir() else package.parent / "phantoms"

@@ -200,7 +200,7 @@ def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[n
     """Signed distance, voxels, below 0 inside, to the zero of `lead`, which is linear between voxels and >= 0 inside.
 
     The first-order upwind solution of |grad d| = 1 (Sethian 1996, PNAS 93, 1591), in sweeps of all voxels. Along an
-    axis that crosses the surface beside a voxel, the upwind place is the crossing, so that planes are exact there.
+    axis that crosses the surface next to a voxel, the upwind place is the crossing, so that planes are exact there.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
@@ -214,7 +214,7 @@ def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[n
 
 
 def _crossing(lead: NDArray[np.float32], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float32]:
-    """The step from each voxel's centre along an axis, either way, to the zero of the lead; infinite beyond 1."""
+    """Distance from each voxel's centre along an axis, either way, to the zero of `lead`; infinite beyond 1."""
     step = np.full(inside.shape, np.inf, dtype=np.float32)
     along, own, side = (np.moveaxis(each, axis, 0) for each in (step, lead, inside))
     is_crossed = side[1:] != side[:-1]

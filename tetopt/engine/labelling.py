@@ -72,7 +72,7 @@ class LabelVoxels(NamedTuple):
 
     components: list[NDArray[np.int64]]  # voxels in each component of each label, descending
     is_apart: NDArray[np.bool_]  # (K, K) as in `Contacts`
-    places: NDArray[np.int64]  # flat indices of voxels beside one of a label that is apart from theirs
+    places: NDArray[np.int64]  # flat indices of voxels next to one of a label that is apart from theirs
 
 
 class Labelling(NamedTuple):
@@ -479,7 +479,7 @@ def _is_disc(
             continue
         if (labels[other] == label) == is_of:
             return False
-        for k in range(n):  # the outside, beyond a facet that has all of S, too
+        for k in range(n):  # the same for the outside, beyond a facet that contains all of S
             if not is_of and across[other, k] < 0 and not _is_opposite(cells, other, k, cell, is_shared):
                 return False
     # The cell's own boundary facets are shared already: none of them contains all of S.

@@ -666,7 +666,7 @@ def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple
 def _try_place(
     search: Search, place: tuple, limit: float, least: float, node: int, state: State, stars: NodeStars
 ) -> float:
-    """Energy of the star with the node at a place, ticks, or on the surface beside it; the best place is stored."""
+    """Measure the star's energy with the node at a place (ticks), or on the nearby surface; store the best place."""
     put_row(state.complex.ticks, node, place)
     if search.is_sliding and not slid(search.normal, state, stars, node):
         return np.inf

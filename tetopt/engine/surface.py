@@ -11,9 +11,9 @@ from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels this near to 0 lies on all of them
-CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there
-CURVE_STEPS = 16  # at most, onto a curve or a point
-NEWTON_STEPS = 6  # at most, onto the surface
+CURVE_STEP_VOXELS = 0.7  # longest step towards such a place, since levels bend there
+CURVE_STEPS = 16  # maximum number of steps onto a curve or a point
+NEWTON_STEPS = 6  # maximum number of steps onto the surface
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
 ASIDE_VOXELS = 0.25  # distance to either side of a place for the slope of the level
 MOST_MEETING = 4  # most labels whose levels a node is moved onto; where more meet, four of them

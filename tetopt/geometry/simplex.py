@@ -85,7 +85,7 @@ Vectors = list[NDArray[np.float64]]  # n components, (M,) each: three times as f
 
 
 def _corners(points: Points, cells: Cells) -> list[Vectors]:
-    """Each cell's corners, one after the other."""
+    """Coordinates of each corner of the cells."""
     axes = [np.ascontiguousarray(axis)[cells.T] for axis in points.T]
     return [[axis[k] for axis in axes] for k in range(cells.shape[1])]
 

@@ -139,7 +139,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
 
 
 class _BlockLimits(NamedTuple):
-    """Targets and limits for the blocks' edges, mm, and the number of equal blocks beside one another."""
+    """Targets and limits for the blocks' edges, mm, and the number of equal blocks side by side."""
 
     largest: float
     target: NDArray[np.float32] | None  # of the image's shape: usual edge of cells at each voxel

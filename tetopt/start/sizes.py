@@ -285,7 +285,7 @@ class Sizes(NamedTuple):
         self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
         volume: float | None = None,
     ) -> NDArray[np.float64]:  # fmt: skip
-        """The longest edge that a cell at each node may get.
+        """Longest edge allowed at each node.
 
         Parameters
         ----------

@@ -151,7 +151,7 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
 
 
 def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
-    """Boxes of whole rows, plane by plane: their voxels, (C, P, R, K), and the mask of those inside, (P, R, K)."""
+    """Yield boxes of whole rows, plane by plane: their voxels (C, P, R, K), and the mask (P, R, K) of voxels inside."""
     image, channels, inside = content.image, content.channels, content.inside
     for box in image.boxes():
         own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)

@@ -165,7 +165,7 @@ def _filled(word: str, values: dict[str, str]) -> str:
 def _own_labels(
     loaded: MeshFile, kept: NDArray[np.int64], job: PipelineInput
 ) -> tuple[NDArray[np.int64] | None, list[str]]:
-    """Return a program's labels of the kept cells, "label" in its file, -1 for labels that the image does not have.
+    """Return the kept cells' labels from "label" in a program's file; -1 stands for labels that the image lacks.
 
     A label that all cells share is the number of a file's only part.
     """
