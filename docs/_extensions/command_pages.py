@@ -174,7 +174,7 @@ class ParametersDirective(SphinxDirective):
 
 
 def _note_sources(directive: SphinxDirective) -> None:
-    """The page is written anew where the command line has changed since."""
+    """Rewrite the page if the command line has changed since."""
     for path in sorted(Path(inspect.getfile(main)).parent.glob("*.py")):
         directive.env.note_dependency(str(path))
 

@@ -384,7 +384,7 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
     path = tmp_path / name
     nifti(path) if name == "a.nii.gz" else path.write_bytes(nrrd())
     monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
-    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* are free; crop or resample it first")
+    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* is free; crop or resample it first")
     if name == "a.nrrd":
         refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$")
 

@@ -164,7 +164,7 @@ def is_lost(error: BaseException) -> bool:
 def lost_words(attempts: int) -> str:
     """Return the reason why a task with this many lost attempts has no result."""
     times = f", {attempts} times" if attempts > 1 else ""
-    return f"its worker ended{times}, as systems do to processes that use too much memory"
+    return f"its worker ended{times}, possibly because it used too much memory"
 
 
 def _measured(function: Callable[[Any], Any], threads: int, name: Any) -> Done:

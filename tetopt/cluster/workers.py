@@ -113,7 +113,7 @@ def check_installed(extra: str) -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         hint = install_hint(extra, *DASK_PACKAGES)
-        raise InputError(f"{error.name} is not installed, by which dask runs tasks; {hint}") from error
+        raise InputError(f"{error.name} is not installed, but dask needs it to run tasks; {hint}") from error
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)

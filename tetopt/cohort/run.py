@@ -122,7 +122,7 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
     words = signal_words(child.returncode)
     reason = _reason(log, child.returncode) if words is None else f"ended by {words}"
     if words is not None and "SIGKILL" in words:
-        reason += f", as systems do when memory runs out; it used {peak / 1e9:.2g} GB"
+        reason += f", possibly because memory ran out; it used {peak / 1e9:.2g} GB"
     return Ended(job.key, "failed", reason, seconds, peak), words is not None
 
 
