@@ -93,7 +93,7 @@ def shrink(source: Path, path: Path) -> None:
 
 
 def method_figure() -> Figure:
-    """The paper's phantom: its lattice, after one iteration and after twenty, and with nodes exchanged; E next to it."""
+    """The paper's phantom: its lattice, after one and twenty iterations, and with nodes exchanged; next to it, E."""
     image = tetopt.load_phantom("fig2_2d").image()
     lattice = tetopt.lattice_mesh(image, nodes=113)
     moved = {n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n, tolerance=0.0) for n in (1, 20)}
