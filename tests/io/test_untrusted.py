@@ -306,7 +306,7 @@ def test_voxels_lie_beside_their_header(tmp_path, name):
     }
     for header, raw in headers.items():
         (inner / header).write_bytes(raw)
-        refused(load_image, inner / header, "given by its bare name|damaged")
+        refused(load_image, inner / header, "named without a folder|damaged")
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_no_header_hides_where_its_voxels_are(tmp_path, header):
     if header.startswith("#"):
         header = header * 11_000 + "data file: ../a.raw\n"
     (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
-    refused(load_image, tmp_path / "inner" / "a.nhdr", "given by its bare name|a header of more than 1048576 bytes")
+    refused(load_image, tmp_path / "inner" / "a.nhdr", "named without a folder|a header of more than 1048576 bytes")
 
 
 def test_no_list_of_files_goes_on_unread(tmp_path):
