@@ -37,7 +37,7 @@ PALETTE_COLOURS = (256, 128, 64, 32)  # as many as the bytes allow, of PNGs whos
 LARGEST_BYTES = 250_000  # of a picture, so that a page loads at once
 LARGEST_WIDTH = 1400  # pixels: the column of a page on a screen of twice the usual density
 PICTURE_DPI = 140  # a figure of nine inches fills the column of a page on a screen of usual density
-# The pictures that other commands draw, which stand beside these.
+# The pictures that other commands draw, shown next to these.
 COMMANDS = {
     "demo.png": "make measured, which shrinks slices.png of its comparison",
     "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
@@ -93,7 +93,7 @@ def shrink(source: Path, path: Path) -> None:
 
 
 def method_figure() -> Figure:
-    """The paper's phantom: its lattice, after one iteration and after twenty, and with nodes exchanged; E beside it."""
+    """The paper's phantom: its lattice, after one and twenty iterations, and with nodes exchanged; next to it, E."""
     image = tetopt.load_phantom("fig2_2d").image()
     lattice = tetopt.lattice_mesh(image, nodes=113)
     moved = {n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n, tolerance=0.0) for n in (1, 20)}
@@ -178,7 +178,7 @@ def move_figure() -> Figure:
 
 
 def flip_figure() -> Figure:
-    """The three ways in which cells are connected anew, each with E_D over what it was before."""
+    """The three ways to reconnect cells, each with E_D relative to its value before."""
     image = _half_bright()
     square = np.array([[1.5, 2.0], [11.5, 1.0], [12.5, 11.5], [2.0, 12.0]])
     middle = np.vstack([square, [[9.2, 5.75]]])

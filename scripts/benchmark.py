@@ -1,4 +1,4 @@
-"""Benchmark tetopt on this machine, in whole processes and beside other meshers; prints a table, writes JSON.
+"""Benchmark tetopt on this machine, in whole processes and next to other meshers; prints a table, writes JSON.
 
     python scripts/benchmark.py -o bench.json [IMAGE]
 

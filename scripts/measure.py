@@ -277,7 +277,7 @@ def words_of(name: str) -> set[str]:
 
 def measure(name: str, paths: dict[str, str], folder: Path) -> None:
     """Run a measurement's commands, and replace its entry in `DATA`."""
-    if (folder / LOG).exists():  # of an earlier measurement, whose outputs would be refused or read again
+    if (folder / LOG).exists():  # of an earlier measurement, whose outputs would be rejected or read again
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     entry: dict[str, Any] = {"version": tetopt.__version__, "commit": commit(), "date": f"{datetime.date.today()}"}

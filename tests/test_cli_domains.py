@@ -250,7 +250,7 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "square.nii.gz: resampled to the image's grid (linear)" in said
     assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
-    assert "% of it lies within the image; is it of the same scan?" in said
+    assert "% of it lies within the image; is it from the same scan?" in said
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):

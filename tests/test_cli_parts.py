@@ -193,7 +193,7 @@ def test_predicted_parts(tmp_path, inputs, capfd):
     assert exit_code(*command, "--worker-gb", 0.1) == 0
     captured = capfd.readouterr()
     assert captured.out.startswith("about 2 parts per round, each up to ")
-    assert "--worker-gb 0.1: less than a worker takes" in captured.err
+    assert "--worker-gb 0.1: less than a worker needs" in captured.err
     assert list(tmp_path.iterdir()) == []
 
 

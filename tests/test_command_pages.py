@@ -60,5 +60,5 @@ def test_all_commands_are_listed():
     """Each with a link to its page and its line."""
     lines = command_pages.listed()
     assert len(lines) == len(COMMANDS) + 1
-    assert "- [`tetopt phantom`](phantom.md): Write a phantom as an image: known shapes, known intensities." in lines
+    assert "- [`tetopt phantom`](phantom.md): Write a phantom as an image of known shapes and intensities." in lines
     assert lines[-1].startswith("- [`python -m tetopt.bids`](bids.md): `tetopt cohort` with the arguments")

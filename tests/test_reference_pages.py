@@ -40,7 +40,7 @@ def test_phantom_keys():
     """The page's keys are those that the reader takes, and its phantoms those that there are."""
     top = [*phantom._TOP_KEYS, *phantom._TOP_OPTIONS]
     text = page("phantom_file")
-    assert sorted(name.strip("[]") for name in first_column(text, "The whole")) == sorted(top)
+    assert sorted(name.strip("[]") for name in first_column(text, "Top level")) == sorted(top)
     of_kinds = {key for keys in phantom._SHAPE_KEYS.values() for key in keys}
     assert set(first_column(text, "Each shape")) == {"kind", "intensity", "label", "name", "rotation_deg", *of_kinds}
-    assert first_column(text, "The phantoms that tetopt brings along") == phantom.phantom_names()
+    assert first_column(text, "Built-in phantoms") == phantom.phantom_names()

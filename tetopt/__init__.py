@@ -16,7 +16,7 @@ _loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)  # the n
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, whose module is loaded when it is first used: `tetopt --help` needs none of the kernels."""
+    """Return a public name, loading its module on first use: `tetopt --help` needs no kernels."""
     value = _loaded(name)
     if isfunction(value):  # whoever calls it by this name may give it anything
         value = import_module("tetopt.system.public").checked(value)

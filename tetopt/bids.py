@@ -19,7 +19,7 @@ LEVELS = ("participant", "group")
 USAGE = "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-label L ...] [options of tetopt cohort]"
 ABOUT = """
 Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
-subjects, may write to one OUT at the same time. group: write the table and the page of all subjects in OUT.
+subjects, may write to the same OUT at once. group: write the table and the page of all subjects in OUT.
 All options of `tetopt cohort` follow the level (python -m tetopt cohort --help), including those of `tetopt mesh`;
 their names may contain underscores instead of hyphens.
 """

@@ -126,7 +126,7 @@ class Mesh:
         cut : bool
             Remove the cells of the right, front, upper octant of a 3-D mesh to show its inside.
         name : str
-            Name of the values beside the colour bar.
+            Name of the values, shown at the colour bar.
         screenshot : str or Path, optional
             Picture file to write, such as ".png"; no window opens.
         off_screen : bool, optional
@@ -199,7 +199,7 @@ class Mesh:
         """Make a mesh of the tetrahedra of a pyvista or VTK grid; if it has none, of its triangles.
 
         Cells keep their order, and inverted ones are reoriented (two of their nodes are swapped). Unused nodes,
-        vertices, lines, and triangles beside tetrahedra are dropped. Quadratic cells keep only their corners, so that
+        vertices, lines, and triangles next to tetrahedra are dropped. Quadratic cells keep only their corners, so that
         curved edges become straight. Data are not copied: `grid.cell_data` fits if the grid has no other cells,
         `grid.point_data` if each of its nodes is a corner of a cell.
 

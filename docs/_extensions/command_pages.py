@@ -174,7 +174,7 @@ class ParametersDirective(SphinxDirective):
 
 
 def _note_sources(directive: SphinxDirective) -> None:
-    """The page is written anew where the command line has changed since."""
+    """Rewrite the page if the command line has changed since."""
     for path in sorted(Path(inspect.getfile(main)).parent.glob("*.py")):
         directive.env.note_dependency(str(path))
 
@@ -187,7 +187,7 @@ def _panels(name: str) -> list[str]:
 
 
 def summary(name: str) -> str:
-    """A command in one line."""
+    """Return a command as one line."""
     return help_line(name) if name in COMMANDS else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
 
 

@@ -1,6 +1,6 @@
 """Tables of the keys of a JSON file, made of its JSON Schema when the site is built.
 
-The directive `schema` has the name of a schema beside the page: tables of its keys, with what they are, their types
+The directive `schema` has the name of a schema next to the page: tables of its keys, with their meanings, their types
 and units (the annotation "unit"); a section for each object at the top, and for each of the definitions.
 """
 
@@ -22,7 +22,7 @@ Schema = dict[str, Any]
 def tables(schema: Schema, page: str) -> list[str]:
     """Lines of Markdown: a table of the keys at the top, and a section for each object there and each definition."""
     of_objects = {key: each for key, each in schema["properties"].items() if _keys(each)}
-    lines = ["## The whole", "", *_table(_top_rows(schema, page)), ""]
+    lines = ["## Top level", "", *_table(_top_rows(schema, page)), ""]
     for key, each in of_objects.items():
         about = each.get("description", "").rstrip(".")
         lines += [f"({page}-{key})=", f"## {key}", "", f"{marked(about)}.", "", *_table(_rows(each, "", page)), ""]

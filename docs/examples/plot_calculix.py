@@ -27,7 +27,7 @@ model = tetopt.build_model(mesh, image, young="h", nu=0.4, bins=12, loads=["comp
 # The input file is complete: run ``ccx -i block``. If ``ccx`` is not installed, this program reads
 # ``plot_calculix.frd`` instead, which CalculiX 2.20 computed from the same file.
 #
-# ``tetopt.read_frd`` compares nodes and cells with the mesh and refuses results of another mesh.
+# ``tetopt.read_frd`` compares nodes and cells with the mesh and rejects results of another mesh.
 
 kept = Path("plot_calculix.frd").absolute()
 with tempfile.TemporaryDirectory() as folder:

@@ -3,7 +3,7 @@ Make a first mesh
 =================
 
 Mesh two stiff spheres in a soft block with 800 nodes. Cells are small where the image has detail and large elsewhere.
-One number tells how much of the image the cells miss.
+One number states how much of the image the cells miss.
 """
 
 import pyvista

@@ -2,7 +2,7 @@
 Write a format of your own
 ==========================
 
-To support another solver, write a function from a model to text and register it in one line. The example is SOFA: a
+To support another solver, write a function from a model to text and register it with one call. The example is SOFA: a
 scene with the mesh, a modulus per element, supports, forces and springs. Not yet verified in SOFA.
 """
 
@@ -18,7 +18,7 @@ from tetopt.model.loads import facet_forces, spring_constants
 
 # %%
 # A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads. `repr` writes a number
-# without losing a digit. Each load becomes one SOFA object; anything that a scene cannot represent is refused.
+# without losing a digit. Each load becomes one SOFA object; anything that a scene cannot represent is rejected.
 
 
 def listed(numbers):

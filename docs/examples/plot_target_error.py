@@ -37,7 +37,7 @@ for number, error in zip(numbers, errors, strict=True):
 
 result = tetopt.mesh_image(image, target_error=0.03)
 needed = result.nodes
-print(f"{needed} nodes leave {fraction(result.mesh):.4f}, 0.03 at most as was asked for")
+print(f"{needed} nodes leave {fraction(result.mesh):.4f}, requested: 0.03 at most")
 
 # %%
 # The mesh with an error of 0.03, and its place on the curve.
@@ -52,6 +52,6 @@ figure, right = plt.subplots(figsize=(5, 5), layout="constrained")
 right.loglog(numbers, errors, "o-", color="#2f6db5", label="mesh_image(image, nodes=...)")
 right.loglog([needed], [fraction(result.mesh)], "*", color="#d95f02", markersize=16, label="target_error=0.03")
 right.axhline(0.03, color="#d95f02", linewidth=0.8)
-right.set(xlabel="nodes", ylabel="fraction of variance unexplained")
+right.set(xlabel="nodes", ylabel="unexplained variance")
 right.legend()
 plt.show()

@@ -207,7 +207,7 @@ def test_masks_that_are_none():
     away = image.affine @ _translation(10, 0, 0)
     assert said(labels % 2, away) == (
         "m.nii: the mask lies outside the image's box; it spans 19.0..27.0 x -0.5..2.5 x -0.5..1.5 mm, the "
-        "image -1.0..7.0 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+        "image -1.0..7.0 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     # The boxes overlap, but only where the mask is 0, or a fraction under the half.
     half = image.affine @ _translation(2, 0, 0)
@@ -230,7 +230,7 @@ def test_labels_that_are_none():
     assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
     assert said(labels, _translation(0, 3, 0)) == (
         "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
-        "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+        "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     assert said(labels * 0 + 7) == (
         "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit it or use another file"
@@ -252,7 +252,7 @@ def test_a_contrast_covers_half_of_the_image():
     np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
     assert message(resample_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
         "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
-        "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+        "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     assert message(resample_contrast, "t2", tetopt.Image(other[0]), image) == (
         "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"

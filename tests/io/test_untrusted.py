@@ -266,8 +266,8 @@ ITK_BOMBS = {
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
     "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
-    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "announces 99999999999 x 9 x 9 voxels"),
-    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "announces 32767 x"),
+    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "declares 99999999999 x 9 x 9 voxels"),
+    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "declares 32767 x"),
     "long.nrrd": (nrrd(sizes="9" * 5000), "expected 3 sizes"),
 }
 
@@ -306,7 +306,7 @@ def test_voxels_lie_beside_their_header(tmp_path, name):
     }
     for header, raw in headers.items():
         (inner / header).write_bytes(raw)
-        refused(load_image, inner / header, "given by its bare name|damaged")
+        refused(load_image, inner / header, "named without a folder|damaged")
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_no_header_hides_where_its_voxels_are(tmp_path, header):
     if header.startswith("#"):
         header = header * 11_000 + "data file: ../a.raw\n"
     (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
-    refused(load_image, tmp_path / "inner" / "a.nhdr", "given by its bare name|a header of more than 1048576 bytes")
+    refused(load_image, tmp_path / "inner" / "a.nhdr", "named without a folder|a header of more than 1048576 bytes")
 
 
 def test_no_list_of_files_goes_on_unread(tmp_path):
@@ -372,7 +372,7 @@ def nifti(path, shape=(3, 4, 5), offset=352.0, extension=b"\0\0\0\0", data=bytes
 @pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
 def test_nifti_bombs(tmp_path, name):
     assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
-    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"announces 32767 x 32767 x 32767 voxels, 3.518e\+13")
+    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13")
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
     refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels would begin at byte 1e.30")
     refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels would begin at byte nan")
@@ -384,7 +384,7 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
     path = tmp_path / name
     nifti(path) if name == "a.nii.gz" else path.write_bytes(nrrd())
     monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
-    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* are free; crop or resample it first")
+    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* is free; crop or resample it first")
     if name == "a.nrrd":
         refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$")
 

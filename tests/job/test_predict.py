@@ -52,7 +52,7 @@ def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
     assert exit_code(*words[:2], "-o", tmp_path / "a.vtu", "--target-error", "0.5", "--predict") == 0
     said = capsys.readouterr()
     assert "assuming 4 runs with 5000 nodes" in said.out
-    assert "only 0.001 MB of memory is free, less than this run takes" in said.err.replace("\n", " ")
+    assert "only 0.001 MB of memory is free, less than this run needs" in said.err.replace("\n", " ")
 
 
 def test_what_a_run_refuses_its_prediction_does(image_path, tmp_path, capsys):

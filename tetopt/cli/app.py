@@ -53,7 +53,7 @@ ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
 
 
 class _Plain:
-    """A part of the command line whose help shows no metavar beside switches, which take no value."""
+    """A part of the command line whose help shows no metavar for switches, which take no value."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters, with the metavar removed from switches."""
@@ -147,7 +147,7 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
     """Build the command line; only the command that the arguments name is loaded, the others are placeholders."""
     app = typer.Typer(
         name="tetopt",
-        help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
+        help="Turn a medical volume directly into an image-aligned tetrahedral mesh, without a segmentation.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

@@ -28,11 +28,11 @@ def paper_command(
     seeds: Annotated[int, Option("N", "Random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
-    """Reproduce the paper's figures and table: paper.json, pictures, a page with each printed number beside ours."""
+    """Reproduce the paper's figures and table: paper.json, pictures, and a page that compares the numbers."""
     from tetopt.study.paper_files import reproduce
 
     page, seconds = reproduce(output, image, labels, seeds, force)
-    out.print(escape(f"{page}: the paper's numbers beside ours, in {seconds:.0f} s"))
+    out.print(escape(f"{page}: the paper's numbers next to tetopt's, in {seconds:.0f} s"))
     return 0
 
 

@@ -28,13 +28,13 @@ def fem_command(
         list[Path],
         Option(
             "[IMAGE] MESH",
-            "VTU, VTK or MSH file, sufficient with moduli and loads; modulus mappings use IMAGE's intensities.",
+            "VTU, VTK or MSH file. IMAGE is optional if this has moduli and loads, and provides intensities.",
             is_argument=True,
         ),
     ],
     compress: Annotated[
         float | None,
-        Option("PERCENT", f"Push the bottom in by this much, the top fixed (default with IMAGE {PAPER_PERCENT:g})."),
+        Option("PERCENT", f"Push the bottom in by this much, top fixed (default with IMAGE {PAPER_PERCENT:g})."),
     ] = None,
     conditioning: Annotated[
         bool | None,

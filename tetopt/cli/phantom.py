@@ -29,7 +29,7 @@ def phantom_command(
     labels: Annotated[Path | None, Option("LABELS.nii.gz", "Also write the label of each voxel's centre.")] = None,
     force: ForceOption = False,
 ) -> int:
-    """Write a phantom as an image: known shapes, known intensities."""
+    """Write a phantom as an image of known shapes and intensities."""
     if labels is not None:
         labels = checked_output(labels, OUTPUT_SUFFIXES, force)
     is_folder = output.name.lower().endswith(ZARR_SUFFIX)

@@ -32,7 +32,7 @@ def print_prediction(task: Task) -> None:
         )
     free = available_bytes()
     if n_bytes > free:
-        show_warning(f"only {memory_words(free)} of memory is free, less than this run takes; reduce --nodes or crop")
+        show_warning(f"only {memory_words(free)} of memory is free, less than this run needs; reduce --nodes or crop")
 
 
 def _seconds(value: float) -> str:
@@ -52,6 +52,6 @@ def print_parts(task: Task) -> None:
     )
     free = available_bytes()
     if own > free:
-        show_warning(f"only {memory_words(free)} of memory is free, less than the octree takes; reduce --nodes")
+        show_warning(f"only {memory_words(free)} of memory is free, less than the octree needs; reduce --nodes")
     if job.worker_gb is not None and job.worker_gb * BYTES_PER_GB < need.limit_for(n_bytes):
-        show_warning(f"--worker-gb {job.worker_gb:g}: less than a worker takes; increase it, or increase --parts")
+        show_warning(f"--worker-gb {job.worker_gb:g}: less than a worker needs; increase it, or increase --parts")

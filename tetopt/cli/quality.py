@@ -53,7 +53,7 @@ def quality_command(
 
 
 def _checked_words(came: Judgement) -> str:
-    """Describe what else a valid mesh was checked for."""
+    """Describe the other properties for which a valid mesh was checked."""
     if came.is_masked:
         return "; meshed within a mask, which may have several components"
     return ", in one piece" + (", fills the box" if came.source is not None and came.is_filled else "")

@@ -34,7 +34,7 @@ def warm_up_command() -> int:
     if place.notice is not None:
         raise InputError(f"warm-up: compiled kernels cannot be stored: {place.notice}")
     begin = time.perf_counter()
-    with compiling("compiling all kernels, a minute on two cores") as progress:
+    with compiling("compiling all kernels (a minute on two cores)") as progress:
         link(roots(), progress)
         for n in (3, 2):
             _mesh_balls(n)

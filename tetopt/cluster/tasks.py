@@ -164,7 +164,7 @@ def is_lost(error: BaseException) -> bool:
 def lost_words(attempts: int) -> str:
     """Return the reason why a task with this many lost attempts has no result."""
     times = f", {attempts} times" if attempts > 1 else ""
-    return f"its worker ended{times}, as systems do to processes that use too much memory"
+    return f"its worker ended{times}, possibly because it used too much memory"
 
 
 def _measured(function: Callable[[Any], Any], threads: int, name: Any) -> Done:
@@ -187,7 +187,7 @@ def limit_threads(number: int) -> None:
 
 
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:
-    """Raise the error of a task, in one line if the user can fix it."""
+    """Raise the error of a task, with a one-line message if the user can fix it."""
     what = plain(str(name))
     limit = memory_words(workers.limit) if workers.limit < float("inf") else "all there is"
     advice = "give workers more memory, or make the tasks smaller"

@@ -113,7 +113,7 @@ def check_installed(extra: str) -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         hint = install_hint(extra, *DASK_PACKAGES)
-        raise InputError(f"{error.name} is not installed, by which dask runs tasks; {hint}") from error
+        raise InputError(f"{error.name} is not installed, but dask needs it to run tasks; {hint}") from error
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)
@@ -195,7 +195,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     from distributed import Client
 
     with _answering(address), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on different versions: relevant ones are checked, in one line
+        warnings.simplefilter("ignore")  # on different versions: relevant ones are checked with one message
         client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)

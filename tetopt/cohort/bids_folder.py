@@ -2,8 +2,8 @@
 
 Uses pybids, the field's own library, rather than bids2table or ancpbids: only pybids excludes `derivatives` and
 `sourcedata`, and accepts folders with dots or brackets in their names. It is the slowest, with 4 s for 2,000 subjects
-of 21,000 files and 40 s for 20,000, where the others take 1 s, which is little beside one mesh, and 0.2 s for two
-subjects by name. Only file names are used: a broken or hostile JSON beside an image is never opened.
+of 21,000 files and 40 s for 20,000, where the others take 1 s, little compared with one mesh, and 0.2 s for two
+subjects by name. Only file names are used: a broken or hostile JSON next to an image is never opened.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _check_dataset(folder: Path) -> None:
     try:
         table = json_of(text)
     except ValueError as error:
-        raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; correct it there") from error
+        raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; correct the file") from error
     if not isinstance(table, dict):
         raise InputError(f"{_shown(file)}: expected a table in JSON, got {type(table).__name__}")
 
@@ -123,7 +123,7 @@ def _kind(suffix: str) -> Name:
     name = _name(suffix)
     if name is None or not re.fullmatch("[A-Za-z0-9]+", name.suffix) or {"sub", "ses"} & set(name.entities):
         raise InputError(
-            f"`suffix` {plain(suffix)}: expected the end of a BIDS name, as T1w or acq-mprage_T1w, without .nii.gz; "
+            f"`suffix` {plain(suffix)}: expected the end of a BIDS name, like T1w or acq-mprage_T1w, without .nii.gz; "
             "`participant_label` and `session_label` select subjects and sessions"
         )
     return name

@@ -47,7 +47,7 @@ from tetopt.system.budget import memory_words
 from tetopt.system.files import checked_output
 
 NAMED_FAILURES = 20  # reasons printed: the table and the page have all
-MOST_BESIDE = 200  # subjects of a run beside other runs in the folder, with a lock each: a process may open 1024 files
+MOST_BESIDE = 200  # subjects of a run next to others in the folder, with a lock each: a process may open 1024 files
 PAGE_SECONDS = 60.0  # between updates of the table and page during a run
 PAGE_FRACTION = 0.05  # maximum fraction of the run's time for these updates
 

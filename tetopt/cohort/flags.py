@@ -246,7 +246,7 @@ def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 
 def _is_like(row: Row, margin: float, likeness: list[float]) -> bool:
-    """Return whether a flipped picture is as like the others' as they are; a cropped picture is not."""
+    """Return whether a flipped picture is as similar to the others as they are; a cropped picture is not."""
     turned = present([row.numbers.get("thumbnail.likeness")])[0] + margin
     score = deviations(np.array([*likeness, turned]), False, LEAST_LIKENESS)[-1]
     return bool(score > -limit(len(likeness)))
@@ -322,7 +322,7 @@ def limit(n: int) -> float:
 def units(unit: str, ndim: int) -> Callable[..., str]:
     """Return a formatter for numbers of a unit: volumes in mm^n as ml or l, bytes as MB or GB, seconds as min or h.
 
-    It takes the number and, optionally, a number shown beside it: if neither is `SHORT_RATIO` times the other, both are
+    It takes the number and, optionally, a number shown with it: if neither is `SHORT_RATIO` times the other, both are
     written in the larger one's unit.
 
     Examples

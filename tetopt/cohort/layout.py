@@ -2,7 +2,7 @@
 
 OUT/dataset_description.json                   identifies the folder as a cohort's
 OUT/cohort.tsv, cohort.html                    all subjects
-OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the run's numbers beside it, in a JSON file of the same name
+OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the run's numbers in a JSON file of the same name
 OUT/sub-X[/ses-Y]/figures/                     its pictures
 OUT/logs/KEY.log, KEY.failed.json              output of the last run, and why it failed
 OUT/.work/                                     unfinished outputs (`tetopt.system.work_directory`)

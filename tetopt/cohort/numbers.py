@@ -282,7 +282,7 @@ def column_names(rows: Sequence[Row]) -> list[str]:
 
 
 def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) -> None:
-    """Write every number of every subject as tab-separated text, whole or not at all, with a description beside it.
+    """Write every number of every subject as tab-separated text, whole or not at all, and a description.
 
     Parameters
     ----------

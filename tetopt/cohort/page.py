@@ -87,7 +87,7 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     note += COLOUR_WORDS if n_pictures else ""
     if n_pictures < sum("thumbnail" in row.files for row in rows):
         note += (
-            f" The page has {n_pictures} of them: those of flagged subjects, and a sample of the others; the rest is "
+            f" The page has {n_pictures} of them: those of flagged subjects, and a sample of the others; the rest are "
             "linked."
         )
     if left_out:

@@ -122,12 +122,12 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
     words = signal_words(child.returncode)
     reason = _reason(log, child.returncode) if words is None else f"ended by {words}"
     if words is not None and "SIGKILL" in words:
-        reason += f", as systems do when memory runs out; it used {peak / 1e9:.2g} GB"
+        reason += f", possibly because memory ran out; it used {peak / 1e9:.2g} GB"
     return Ended(job.key, "failed", reason, seconds, peak), words is not None
 
 
 def _reason(log: Path, code: int) -> str:
-    """Return why a run ended, in one line: the last error line, or else the last line."""
+    """Return the reason why a run ended: the last error line, or else the last line."""
     text = log.read_text(encoding="utf-8", errors="replace")
     errors = [
         line.removeprefix(ERROR_MARK)

@@ -52,7 +52,7 @@ def run_all(
 
 
 def _cause(error: BaseException) -> str:
-    """Return why a subject has no result, in one line."""
+    """Return the reason why a subject has no result, without line breaks."""
     if is_lost(error):
         return lost_words(MOST_ATTEMPTS)
     return last_line(" ".join(f"{type(error).__name__}: {error}".split()))

@@ -100,7 +100,7 @@ def read_table(path: Path) -> list[Subject]:
     if problems:
         raise Problems(problems)
     if not subjects:
-        raise InputError(f"{path}: expected a line for each subject below the columns' names, got none")
+        raise InputError(f"{path}: expected a line for each subject below the column names, got none")
     return subjects
 
 
@@ -113,7 +113,7 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             continue
         name = key(each)
         if len(name) > KEY_LETTERS:
-            words = f"{name[:20]}... has {len(name)} letters, for names of files"
+            words = f"{name[:20]}... has {len(name)} letters and is used in file names"
             yield f"{each.place}: {words}; expected at most {KEY_LETTERS}"
             continue
         if name in places:
@@ -197,7 +197,7 @@ def _cells(path: Path) -> list[tuple[int, list[str]]]:
     except csv.Error as error:
         raise InputError(f"{path}, line {reader.line_num}: expected a table, got {error}; correct that line") from error
     if not lines:
-        raise InputError(f"{path}: expected a line of columns' names, such as subject and image, got an empty file")
+        raise InputError(f"{path}: expected a line of column names, such as subject and image, got an empty file")
     return lines
 
 

@@ -309,7 +309,7 @@ def _corners(image: Image) -> NDArray[np.float64]:
 
 
 def _both_boxes(other: Image, image: Image) -> str:
-    return f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both lie in the same world mm?"
+    return f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both use the same world coordinates?"
 
 
 def _extent(image: Image) -> str:

@@ -32,7 +32,7 @@ VOLUME_SIGMA, VOLUME_BLOCK = (
     3.0,
     2,
 )  # least sigma, voxels, of the Gaussian within which volumes are preserved; summed over blocks
-NEAR_SURFACE = 0.05, 0.95  # distance range of voxels beside the surface: below 1, and centres keep their label
+NEAR_SURFACE = 0.05, 0.95  # distance range of voxels next to the surface: below 1, and centres keep their label
 MOST_LIFTED = 1.0  # voxels by which smoothing may change levels farther off: the error of distances to voxels
 LEAST_SLOPE = 0.3  # least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
 FLOW_STEPS = 4  # more steps do not improve spheres of 3 to 20 voxels or shells of 2 to 6
@@ -226,7 +226,7 @@ def _level(
     """The smooth level of a label, (*shape) float32.
 
     Smoothing removes stairs like biharmonic flow: 2 G - G^2, with a Gaussian G, preserves planes and quadrics. Each
-    step then corrects volumes and returns voxels beside the surface to their own side, which undoes excessive
+    step then corrects volumes and returns voxels next to the surface to their own side, which undoes excessive
     smoothing. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
 
     Parameters

@@ -562,7 +562,11 @@ class PhantomVoxels:
             if start < self._next_plane:
                 self._stream, self._next_plane = np.random.default_rng(self.seed), 0
             n_bytes = 8 * (stop - start) * math.prod(self.shape[1:])  # of float64
-            check_memory(n_bytes, f"phantom {self.phantom.name!r}: noise of {stop - start} planes", "take less of it")
+            check_memory(
+                n_bytes,
+                f"phantom {self.phantom.name!r}: noise of {stop - start} planes",
+                "render fewer planes at a time",
+            )
             for _ in range(self._next_plane, start):
                 self._stream.normal(0.0, self.noise_sd, self.shape[1:])
             self._noise = self._stream.normal(0.0, self.noise_sd, (stop - start, *self.shape[1:]))
@@ -571,7 +575,7 @@ class PhantomVoxels:
 
 
 def phantom_folder() -> Path:
-    """Folder of the project's own phantoms: inside the installed package, or beside it in a checkout."""
+    """Folder of the project's own phantoms: inside the installed package, or next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "phantoms"
     return inside if inside.is_dir() else package.parent / "phantoms"

@@ -200,7 +200,7 @@ def _distance(lead: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[n
     """Signed distance, voxels, below 0 inside, to the zero of `lead`, which is linear between voxels and >= 0 inside.
 
     The first-order upwind solution of |grad d| = 1 (Sethian 1996, PNAS 93, 1591), in sweeps of all voxels. Along an
-    axis that crosses the surface beside a voxel, the upwind place is the crossing, so that planes are exact there.
+    axis that crosses the surface next to a voxel, the upwind place is the crossing, so that planes are exact there.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)

@@ -25,7 +25,7 @@ class Statistics(NamedTuple):
     Parameters
     ----------
     mean, low, high : float
-        Mean, least and greatest intensity.
+        Mean, smallest and largest intensity.
     variance : float
         Variance, normalised by the number of voxels.
     noise : float

@@ -1,7 +1,7 @@
 """Predict time and memory of a run of `tetopt mesh` from sizes that are known in advance.
 
 Both are sums of terms, each a size times its unit cost. `tests/benchmarks/fit_cost.py` fits the costs to measured runs
-of whole processes (non-negative least squares of relative errors). They are stored in `cost.toml` beside this module,
+of whole processes (non-negative least squares of relative errors). They are stored in `cost.toml` next to this module,
 with the machine, its speed, and the errors of runs excluded from the fit.
 """
 
@@ -98,7 +98,7 @@ def predicted(size: RunSize, threads: int = 1, speed: float = 1.0) -> Prediction
 
 
 def calibrated_speed() -> float:
-    """Measure the speed of this machine relative to that of the fit, in about a second."""
+    """Return this machine's speed relative to that of the fit, measured in about a second."""
     return cost_model().calibration_seconds / calibration()
 
 

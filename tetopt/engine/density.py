@@ -327,7 +327,7 @@ def _sides_of_edge(state: State, stars: NodeStars, a: int, b: int) -> int:
 
 @unit
 def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
-    """Put the node p at the middle of an edge, or on the surface beside it.
+    """Put the node p at the middle of an edge, or on the nearby surface.
 
     Returns False if it lies on a fixed boundary, or the surface is not reached.
     """

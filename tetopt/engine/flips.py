@@ -795,7 +795,7 @@ def close_gaps(state: State, is_dirty: Bools1) -> None:
         if last == cell:
             last -= 1
             break
-        for k in range(n):  # numba compiles whole rows four times as long
+        for k in range(n):  # to compile copies of whole rows takes numba four times as long
             cells[cell, k], across[cell, k] = cells[last, k], across[last, k]
             for d in range(sums.shape[1]):
                 fluxes[cell, k, d] = fluxes[last, k, d]

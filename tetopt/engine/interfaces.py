@@ -1,7 +1,7 @@
 """Interfaces between labels: their cells, their sliding nodes, and their part of E.
 
 The initial label of a cell follows from its voxels, tension and topology (`tetopt.engine.labelling`). From then on
-labels change only with the mesh: cells beside an interface take the label of a neighbour if that lowers E and
+labels change only with the mesh: cells next to an interface take the label of a neighbour if that lowers E and
 preserves both labels' topology.
 """
 
@@ -44,7 +44,7 @@ BALANCE_LEAK = 0.8  # fraction of its bias that a label keeps if its volume is r
 SMALL_LOSS_FRACTION = 0.04  # of the volume: facets always cut it off round shapes, which would raise the bias forever
 SPARED_LOSS_FRACTION = 0.08  # of a label's volume that is not restored: restoring all of it would cost position (Dice)
 SHIFT_STEP = 0.5  # fraction of the shift that would restore the volume
-MOST_SHIFT_FRACTION = 0.2  # largest shift, of the edge beside a label's surface
+MOST_SHIFT_FRACTION = 0.2  # largest shift, of the edge next to a label's surface
 RELABELLING_PASSES = 10  # at most; the third usually changes nothing
 LEAST_RELABELLING_FRACTION = 1e-9  # of the energies compared: a smaller gain may be rounding
 
@@ -265,7 +265,7 @@ def _meet_everywhere(state: State, stars: NodeStars) -> None:
 
 
 def relabel(state: State, stars: NodeStars) -> int:
-    """Let cells beside an interface take a neighbour's label if E falls and no topology changes; return the number."""
+    """Let cells next to an interface take a neighbour's label if E falls and no topology changes; return the number."""
     n_cells, total = int(state.complex.n_cells[0]), 0
     gain, label, is_stale = np.zeros(n_cells), np.zeros(n_cells, dtype=np.int64), np.ones(n_cells, dtype=bool)
     for _ in range(RELABELLING_PASSES):

@@ -72,7 +72,7 @@ class LabelVoxels(NamedTuple):
 
     components: list[NDArray[np.int64]]  # voxels in each component of each label, descending
     is_apart: NDArray[np.bool_]  # (K, K) as in `Contacts`
-    places: NDArray[np.int64]  # flat indices of voxels beside one of a label that is apart from theirs
+    places: NDArray[np.int64]  # flat indices of voxels next to one of a label that is apart from theirs
 
 
 class Labelling(NamedTuple):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 
-PICTURE_PIXELS = 320  # the longer side of a picture, which stands beside a table of numbers
+PICTURE_PIXELS = 320  # the longer side of a picture, shown next to a table of numbers
 DRAWN_SCALE = 2  # pictures are drawn at this scale and reduced, for smooth edges
 PICTURE_COLOURS = 32  # size of the palette: half of the bytes that 256 colours take
 MARGIN_PIXELS = 4  # around the cells
@@ -40,7 +40,7 @@ CELL_STYLE = "text-align:left;padding:0.15em 0.8em 0.15em 0;vertical-align:top;b
 
 
 def card_html(title: str, rows: Iterable[tuple[str, str]], picture: str = "") -> str:
-    """Return HTML with a title, rows of names and values, and a picture beside them, in the colours of the page.
+    """Return HTML with a title, rows of names and values, and a picture next to them, in the colours of the page.
 
     Title and rows may be any text; they are escaped. `picture` is HTML.
     """

@@ -36,7 +36,7 @@ BYTES_A_VALUE_BYTE = 4  # of memory per byte of voxels by the header: copies of 
 LEAST_SECONDS = 60.0  # for any file, also on a busy machine
 SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of the speed for the slowest of these files
 ARRAY_MARK = "\0array"  # a name that no file contains
-DEFLATE_RATIO = 1032  # zlib's maximum compression: a header that announces more is wrong
+DEFLATE_RATIO = 1032  # zlib's maximum compression: a header that declares more is wrong
 
 
 def read_apart(

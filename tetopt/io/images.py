@@ -108,7 +108,7 @@ def load_image(
     Raises
     ------
     InputError
-        ``"<path>: ..."`` in one line: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
+        ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
         SimpleITK is needed and not installed; a folder has no DICOM series, several, or uneven slices; `open_stored`
         rejects a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
         invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
@@ -623,7 +623,7 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
     n_bytes, size = proxy.offset + (volume + 1) * volume_bytes, path.stat().st_size
     if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
         raise InputError(
-            f"{DAMAGED_FILE} (its header announces {' x '.join(str(each) for each in file.shape)} voxels, "
+            f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, the file has {size})"
         )
     most = proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES

@@ -47,8 +47,8 @@ def checked_header(path: Path) -> tuple[int, int]:
     Raises
     ------
     InputError
-        Without a leading path: the header cannot be read or announces more than the files contain; a data file is not
-        beside the header, or is not a regular file.
+        Without a leading path: the header cannot be read or declares more than the files contain; a data file is not
+        next to the header, or is not a regular file.
     """
     header = _header(path)
     n_bytes = _checked_bytes(path, header)
@@ -57,12 +57,12 @@ def checked_header(path: Path) -> tuple[int, int]:
 
 
 def _checked_bytes(path: Path, header: VoxelHeader) -> int:
-    """Return the number of bytes of all files of the image; InputError if its header announces more, or far fewer."""
+    """Return the number of bytes of all files of the image; InputError if its header declares more, or far fewer."""
     n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
-            f"{DAMAGED_FILE} (its header announces {sizes} voxels, "
+            f"{DAMAGED_FILE} (its header declares {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
     longest = VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
@@ -101,7 +101,7 @@ def _header(path: Path) -> VoxelHeader:
 def _check_beside(path: Path, name: str) -> None:
     """Raise InputError unless the name is that of a regular file in the header's folder."""
     if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
-        raise InputError(f'expected a data file beside the header, given by its bare name, got "{name}"')
+        raise InputError(f'expected a data file next to the header, named without a folder, got "{name}"')
     try:
         other = irregular(path.parent / name)
     except OSError as error:

@@ -64,7 +64,7 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
 
 
 def check_counts(path: Path) -> None:
-    """Raise InputError if the header announces more than the file can contain."""
+    """Raise InputError if the header declares more than the file can contain."""
     size = path.stat().st_size
     if size == 0:
         raise InputError("damaged: the file is empty")

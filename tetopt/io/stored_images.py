@@ -55,7 +55,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     Raises
     ------
     InputError
-        ``"<path>: ..."`` in one line: the reasons of `tetopt.load_image`; the file cannot be read in parts, or is on
+        ``"<path>: ..."``: the reasons of `tetopt.load_image`; the file cannot be read in parts, or is on
         the network; Zarr metadata are damaged, without a scale, do not have three spatial axes, or have units that are
         not lengths; values are not real numbers; codecs are unknown; chunks without a fill value are missing, or all
         chunks.

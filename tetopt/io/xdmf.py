@@ -39,7 +39,7 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This program reads all 
 
 Before 0.7, `fem.functionspace` was `fem.FunctionSpace`; with this change the program also runs with 0.5.2.
 `read_meshtags` uses the first attribute of a grid, which is why `material` comes first. The encoding must be given;
-otherwise dolfinx looks for an HDF5 file beside this one. dolfinx cannot read floating-point cell data from XDMF, hence
+otherwise dolfinx looks for an HDF5 file next to this one. dolfinx cannot read floating-point cell data from XDMF, hence
 the parsing. Quadratic elements are chosen in dolfinx, on cells of either order: a file of order 2 also has the nodes of
 order 2, and dolfinx integrates its cells as curved, as those on interfaces may be.
 

@@ -43,13 +43,13 @@ def unpacked(name: str, packed: bytes, n_bytes: int) -> bytes:
 
         claim = {"blosc": _blosc_bytes, "zstd": _zstd_bytes, "lz4": _lz4_bytes}[name](packed)
         if claim not in (n_bytes, None):
-            raise ValueError(f"a chunk announces {claim} bytes, the array {n_bytes}")
+            raise ValueError(f"a chunk declares {claim} bytes, the array {n_bytes}")
         place = np.zeros(n_bytes, np.uint8)
         numcodecs.get_codec({"id": name}).decode(packed, out=place)
         value = place.tobytes()
     if len(value) != n_bytes:
         count = f"more than {n_bytes}" if len(value) > n_bytes else str(len(value))
-        raise ValueError(f"a chunk unpacks to {count} bytes, the array announces {n_bytes}")
+        raise ValueError(f"a chunk unpacks to {count} bytes, the array declares {n_bytes}")
     return value
 
 

@@ -25,7 +25,7 @@ LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represe
 NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
 ENERGY_RISE = 1e-3  # relative: E is reported if it ended higher above its least value
 LENGTH_ROUNDING = 1e-3  # relative: the tolerance of edges to their limits
-TARGETS_MISSED = 0.1  # of the edges: more that are far over their target are reported
+TARGETS_MISSED = 0.1  # of the edges: a larger fraction far over their targets is reported
 FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are lost
 EULER_FRACTION = 0.5  # of the mask's Euler number: the mesh's may differ by this much
 EULER_USUAL = 8  # smaller Euler numbers are treated as this one, since single holes depend on the cell size
@@ -106,7 +106,7 @@ def warn_of_result(
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
         remedy = "use more iterations, a `k_D` above 0, or larger sizes"
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
-            remedy = f"the target sizes take about {needed}; set `nodes` to that, or use larger sizes"
+            remedy = f"the target sizes need about {needed}; set `nodes` to that, or use larger sizes"
         warning(f"{n_nodes} nodes instead of {nodes}: {remedy}")
     lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
     if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
@@ -121,7 +121,7 @@ def warn_of_result(
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
         remedy = "reduce `nodes`"
         if spacing.max() >= THICK_SLICES * spacing.min():
-            remedy = f"slices are {spacing.max():.3g} mm apart, and cells between them are usual"
+            remedy = f"slices are {spacing.max():.3g} mm apart, so some cells lie between them"
         warning(
             f"{n_empty} of {len(result.mesh.cells)} cells contain no voxel centre: these contribute nothing to E_D and "
             f"take the nearest voxel's value; {remedy}"
@@ -152,12 +152,12 @@ def warn_of_sizes(sizes: Sizes, shortest: float, longest: float, edges: EdgeRati
     if sizes.longest is not None and longest > sizes.longest * (1.0 + LENGTH_ROUNDING):
         warning(
             f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over `edge_max` "
-            f"{sizes.longest:g}: splits and collapses keep the limit, but nodes move apart; lower it"
+            f"{sizes.longest:g}: splits and collapses respect it, but nodes move apart; lower it"
         )
     if shortest < sizes.smallest * (1.0 - LENGTH_ROUNDING):
         warning(
             f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} under `size_min` "
-            f"{sizes.smallest:g}: splits keep the limit, but nodes move together; raise it"
+            f"{sizes.smallest:g}: splits respect it, but nodes move together; raise it"
         )
     if edges is not None and edges.above > TARGETS_MISSED:
         warning(

@@ -81,7 +81,7 @@ def with_parts(plan: Plan) -> Plan:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
     if job.worker_gb is not None and (job.scheduler or job.cluster):
         raise InputError(
-            "`worker_gb`: only for workers on this machine; those of `scheduler` and `cluster` have their own"
+            "`worker_gb`: only for workers on this machine; those of `scheduler` and `cluster` have their own limits"
         )
     check_choice(job.workers, job.scheduler, job.cluster, "blocks")
     file = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))

@@ -105,11 +105,11 @@ def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bo
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
     note(f"{path}: resampled to the image's grid (nearest neighbour)")
     if not is_cropped and inside < IN_IMAGE_FRACTION * whole:
-        warning(f"{path}: only {inside / whole:.0%} of it lies within the image; is it of the same scan?")
+        warning(f"{path}: only {inside / whole:.0%} of it lies within the image; is it from the same scan?")
 
 
 def read_companion(path: Path) -> Image:
-    """Read a file beside the image, without the warning for a constant image, which sizes or a mask may be."""
+    """Read another file with the image, without the warning for a constant image, which sizes or a mask may be."""
     file, volume = file_and_volume(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "(?s).* everywhere, so E_D is 0")

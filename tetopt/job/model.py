@@ -307,7 +307,7 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
 
 
 def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Path | None:
-    """Keep an optimised mesh beside its file until that is written, in case the process ends; return the path."""
+    """Keep an optimised mesh next to its file until that is written, in case the process ends; return the path."""
     early = next(kept_places(output, ".vtu"))
     try:
         data = {} if labels is None else {"label": labels}

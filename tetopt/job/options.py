@@ -109,7 +109,7 @@ class RegionOptions:
     labels: Annotated[Path | None, Option("LABELS", "Label image: each cell gets one label.")] = None
     tissues: Annotated[
         Path | None,
-        Option("FILE,...", "Tissue probabilities instead of labels: one file each, or one 4-D file; 0 is the rest."),
+        Option("FILE,...", "Tissue probabilities instead of labels: one file each, or a 4-D file; 0 is the remainder."),
     ] = None
     merge: Annotated[
         str | None,
@@ -134,7 +134,7 @@ class RegionOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ContentOptions(ImagePart, RegionOptions):
-    """Meshed part of an image, and the files beside it."""
+    """Meshed part of an image, and the files that accompany it."""
 
     panel: ClassVar[str] = "Region and labels"
 
@@ -163,7 +163,8 @@ class SizeOptions:
         ),
     ] = None
     target_error: Annotated[
-        float | None, Option("T", "Instead, use as many nodes as leave this fraction of the image's variance.")
+        float | None,
+        Option("T", "Instead of a number of nodes: the fraction of the image's variance left unexplained."),
     ] = None
     size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = None
     edge_size: Annotated[
@@ -364,7 +365,7 @@ class SolverOptions(ModelOptions):
 class OutputOptions:
     """Outputs of a run."""
 
-    panel: ClassVar[str] = ""  # beside those of the command
+    panel: ClassVar[str] = ""  # with those of the command
     output: Annotated[Path, Option("MESH", f"The mesh to write: {', '.join(FORMATS)}.", letter="o")]
     json_path: JsonOption = None
     figures: Annotated[

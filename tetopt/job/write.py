@@ -67,7 +67,7 @@ def model_with(
 def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
     """Write the mesh, or save it elsewhere; return the model, and the files' statements about the run.
 
-    Until its file exists, a copy of the mesh is kept beside it, as cell fields are measured before. Measurements that
+    Until its file exists, a copy of the mesh is kept next to it, as cell fields are measured first. Measurements that
     fail are left out, and noted in `failed`.
     """
     plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields

@@ -171,7 +171,7 @@ class Quality(NamedTuple):
             ("nodes", f"{self.n_nodes:,}"),
             ("cells", f"{self.n_cells:,}"),
             ("volume", f"{self.volume:.6g} mm^{self.ndim}"),
-            ("rho", f"mean {self.mean_rho:.3f}, 1st percentile {self.p1_rho:.3f}, least {self.min_rho:.3f}"),
+            ("rho", f"mean {self.mean_rho:.3f}, 1st percentile {self.p1_rho:.3f}, smallest {self.min_rho:.3f}"),
             ("angles", f"{self.min_dihedral:.1f} to {self.max_dihedral:.1f} degrees"),
             ("below 10 degrees", f"{self.n_under_10_degrees:,} cells"),
             ("badly shaped", ", ".join(f"{count:,} {kind}s" for kind, count in self.kinds.items() if count) or "none"),

@@ -53,7 +53,7 @@ def parse_average(text: str) -> Average:
     Raises
     ------
     InputError
-        The text is none of these.
+        The text has another form.
 
     Examples
     --------
@@ -208,7 +208,7 @@ def element_young(
 
 
 def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
-    """Interpolate nodal moduli (N,) to the Gauss points (M, Q) of cells of an order, kPa.
+    """Interpolate nodal moduli (N,), kPa, to the Gauss points (M, Q) of cells of the given order.
 
     Moduli are linear within a cell, like temperature-dependent moduli in Abaqus and CalculiX.
     """

@@ -10,7 +10,7 @@ from tetopt.image import Image
 from tetopt.parts.rounds import expected_parts
 
 FEWEST_NODES_EACH = 100  # per part: half of 150 nodes are shared and fixed
-WORK_SUFFIX = ".work"  # of the work directory beside the mesh, appended to its name
+WORK_SUFFIX = ".work"  # of the work directory next to the mesh, appended to its name
 
 Way = TypeVar("Way")
 

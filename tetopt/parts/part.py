@@ -24,7 +24,7 @@ from tetopt.mesh import Mesh
 from tetopt.parts.work import checksum, done_path, load_arrays, open_volume, save_arrays
 from tetopt.start.sizes import Sizes
 
-MARGIN_SIZE = 2  # voxels around a part's nodes: the reach of the sampling beside a facet, and one more
+MARGIN_SIZE = 2  # voxels around a part's nodes: the reach of the sampling around a facet, and one more
 
 Kind = Literal["measure", "improve", "fields"]
 

@@ -29,7 +29,7 @@ function start() {
     return;
   }
   const notes = data.skipped.length
-    ? [`Not shown, as they are not one number per cell or node: ${data.skipped.join(", ")}.`] : [];
+    ? [`Not shown, because they are not one number per cell or node: ${data.skipped.join(", ")}.`] : [];
   const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (data.image && Math.max(...data.image.shape) > most) {
     notes.push(`This graphics card supports at most ${most} voxels along an axis, so the image is not shown.`);

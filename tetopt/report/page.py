@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tetopt.io.text import plain
 from tetopt.system.files import save_text
 
-# The script files, beside this one, of each page.
+# The script files of each page, in this folder.
 PAGE_SCRIPTS = {
     "viewer": ("webgl.js", "viewer.js"),
     "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),

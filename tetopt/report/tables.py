@@ -96,7 +96,7 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
 
 
 def sizes_in_words(edges: EdgeRatios) -> str:
-    """Describe how well the edges of a mesh match their target sizes, in one line."""
+    """Describe how well the edges of a mesh match their target sizes."""
     return (
         f"ratio of edges to their target size: {edges.mean:.2f} on average; {edges.below:.1%} are below "
         f"{SHORT_EDGE_FRACTION:.2f}, "
@@ -105,7 +105,7 @@ def sizes_in_words(edges: EdgeRatios) -> str:
 
 
 def curving_in_words(curving: Curving) -> str:
-    """Describe the curved edges on interfaces and on a mask's surface, in one line."""
+    """Describe the curved edges on interfaces and on a mask's surface."""
     return (
         f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node on the surface, "
         f"{curving.n_part_way} are partly curved and {curving.n_straight} are straight; largest offset "
@@ -176,7 +176,7 @@ def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], nd
 
 
 def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
-    """Describe the excess contact between labels, in one line."""
+    """Describe the excess contact between labels."""
     unit = "mm2" if ndim == 3 else "mm"
     return (
         f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: {totals['excess_mm2']:.1f} {unit}, including "

@@ -15,7 +15,7 @@ from tetopt.geometry.topology import compact, components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-# of the largest component of cells within a component of voxels: smaller ones beside it are dropped
+# of the largest component of cells within a component of voxels: smaller ones are dropped
 DROPPED_FRACTION = 0.1
 
 

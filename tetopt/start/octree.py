@@ -156,7 +156,7 @@ def _given(content: Content, sizes: Sizes | None) -> str:
 
 
 class _BlockLimits(NamedTuple):
-    """Targets and limits for the blocks' edges, mm, and the number of equal blocks beside one another."""
+    """Targets and limits for the blocks' edges, mm, and the number of equal blocks side by side."""
 
     largest: float
     target: NDArray[np.float32] | None  # of the image's shape: usual edge of cells at each voxel
@@ -195,7 +195,7 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
     """The target by voxel, mm; raise InputError if a field has none."""
     target = sizes.on_voxels(image)
     if target.min() >= NO_BOUND_MM:
-        raise InputError("field: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+        raise InputError("field: no voxel above 0 lies in the image's box; do both use the same world coordinates?")
     return target
 
 

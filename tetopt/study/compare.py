@@ -53,7 +53,7 @@ from tetopt.system.files import save_json
 from tetopt.system.incoming import own_bytes, text_of
 from tetopt.system.work_directory import LOCK_NAME, Layout, locked
 
-Facts = dict[str, Any]  # inputs of a comparison besides its settings, as JSON values
+Facts = dict[str, Any]  # inputs of a comparison in addition to its settings, as JSON values
 # Settings that do not affect a finished run's numbers: the other pipelines, and limits that it has met. Its own number
 # of nodes and its program are part of its key, and so is the reference's size, once decided.
 FREE_SETTINGS = {
@@ -423,7 +423,7 @@ def _key(bench: Bench, name: str) -> str:
 
 
 def _run_path(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Path:
-    """Return the path of a run's numbers; its mesh is beside it."""
+    """Return the path of a run's numbers; its mesh is next to it."""
     return bench.folder / f"{name}-{nodes}{'-quadratic' if order == 2 else ''}-{repeat}.json"
 
 
@@ -439,7 +439,7 @@ def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
 
 
 def _kept(path: Path, key: str) -> Attempt | None:
-    """Return a finished run's numbers if they are complete and belong to the same key and to the mesh beside them."""
+    """Return a finished run's numbers if they are complete and belong to the same key and to the mesh next to them."""
     content = _read_back(path)
     if not isinstance(content, dict) or content.get("key") != key:
         return None

@@ -200,7 +200,7 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
     blind = {
         "strain_energy": "errors that cancel each other: it is one number for the whole body",
         "displacement": "strains, which may be wrong even if displacements are right",
-        "interface_strain": "anything but the voxels beside interfaces of the labels or classes",
+        "interface_strain": "anything but the voxels next to interfaces of the labels or classes",
     }
     known = report.reference.by_nu.get(nu)
     own = {} if known is None else known.own_error._asdict()  # the reference's, without strain

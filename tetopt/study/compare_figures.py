@@ -40,7 +40,7 @@ SHORT_RANGE = 12.0  # ratio of the ends of a logarithmic axis: below it, powers 
 
 
 def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
-    """The image's middle axial slice and, beside it, each mesh in that slice: its edges, its means, its E_D.
+    """The image's middle axial slice and, next to it, each mesh in that slice: its edges, its means, its E_D.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ import numpy as np
 from tetopt.study.compare_criteria import judged_labels, number_text, volume_error, voxels_by_label, which_labels
 from tetopt.study.compare_report import PipelineResult, Report
 
-# Fields of `LabelRow` to show for each label, besides its volume error.
+# Fields of `LabelRow` to show for each label, in addition to its volume error.
 SHOWN_FIELDS = (
     "dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_fraction", "area_ratio", "folded",
     "one_layer_fraction", "excess_contact_mm2",

@@ -13,7 +13,7 @@ from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
 
-# The files are flatter than the records: the keys of these fields' values are beside those of the record itself,
+# The files are flatter than the records: the keys of these fields' values are among those of the record itself,
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
 # and these fields are left out where they are None.
 OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")

@@ -50,12 +50,12 @@ def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = N
     free = available_bytes()
     if n_bytes > free:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes)} of memory, {memory_words(free)} are free; {advice}"
+            f"{what}: needs about {memory_words(n_bytes)} of memory, {memory_words(free)} is free; {advice}"
         )
     if limit is not None and n_bytes + resident_bytes() > limit:
         raise InputError(
             f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in total, "
-            f"{memory_words(limit)} are allowed; {advice}"
+            f"{memory_words(limit)} is allowed; {advice}"
         )
 
 

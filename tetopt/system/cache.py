@@ -1,6 +1,6 @@
-"""The folder of compiled kernels: beside the package, else the user's cache, else a temporary one for this process.
+"""The folder of compiled kernels: next to the package, else the user's cache, else a temporary one for this process.
 
-Kernels beside the package are always read.
+Kernels next to the package are always read.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Place(NamedTuple):
 def place_cache() -> Place:
     """Make sure that numba finds a folder for its cache, at least a temporary one.
 
-    numba looks in NUMBA_CACHE_DIR, else beside the source, else in the user's cache folder, and runs the code that it
-    reads there. World-writable folders are therefore not used, whoever owns them. Subfolders, and the folder beside
+    numba looks in NUMBA_CACHE_DIR, else next to the source, else in the user's cache folder, and runs the code that it
+    reads there. World-writable folders are therefore not used, whoever owns them. Subfolders, and the folder next to
     the source, must not be writable by anyone else at all (`untrusted`).
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")

@@ -29,7 +29,7 @@ UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno
 
 
 class TakenError(InputError):
-    """Another program took the output's name during the run; the output is kept beside it."""
+    """Another program took the output's name during the run; the output is kept next to it."""
 
 
 class Outputs(NamedTuple):
@@ -178,7 +178,7 @@ def check_space(path: Path, n_bytes: int) -> None:
 
 @contextmanager
 def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """Give a temporary path beside `path`, with its suffix, that replaces `path` when the block ends without error.
+    """Give a temporary path next to `path`, with its suffix, that replaces `path` when the block ends without error.
 
     After an error or an interruption, the previous file is unchanged. After a kill or a power cut, the old or the new
     file is whole, and a temporary file, whose name begins with a dot, may remain. The new file keeps the permissions
@@ -235,7 +235,7 @@ def _hidden(path: Path) -> str:
 
 
 def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = "") -> Path:
-    """Create a folder beside an output until the stack is unwound; files that cannot be removed remain, hidden."""
+    """Create a folder next to an output until the stack is unwound; files that cannot be removed remain, hidden."""
     temporary = Path(tempfile.mkdtemp(prefix=_hidden(path), suffix=suffix, dir=folder))
     stack.callback(shutil.rmtree, temporary, ignore_errors=True)
     return temporary
@@ -307,7 +307,7 @@ def save_json(path: Path, value: Any) -> None:
 
 
 def kept_places(path: Path, suffix: str) -> Iterator[Path]:
-    """Yield free names for an output that cannot be written to `path`: beside it, then in new temporary folders."""
+    """Yield free names for an output that cannot be written to `path`: next to it, then in new temporary folders."""
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
     places = (path.with_name(f"{name}{suffix}") for name in names)
     yield next(place for place in places if place != path and not os.path.lexists(place))
@@ -396,7 +396,7 @@ def _linked(temporary: Path, place: Path) -> bool:
 
 
 def _beside(temporary: Path, path: Path) -> Path:
-    """Give the file a free name beside its own; return the name."""
+    """Give the file a free name next to its own; return the name."""
     end = next((path.name[-len(each) :] for each in (".nii.gz",) if path.name.lower().endswith(each)), path.suffix)
     stem = path.name[: len(path.name) - len(end)]
     return next(kept for number in count(1) if _linked(temporary, kept := path.with_name(f"{stem}_kept_{number}{end}")))

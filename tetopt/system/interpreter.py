@@ -28,7 +28,7 @@ def python_environment(**names: str) -> dict[str, str]:
 
 
 def others_environment() -> dict[str, str]:
-    """Return the environment of a user's program, which may be in Python and import modules beside itself."""
+    """Return the environment of a user's program, which may be in Python and import modules from its own folder."""
     return {name: value for name, value in os.environ.items() if name != SAFE_PATH_NAME}
 
 

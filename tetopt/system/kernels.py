@@ -324,7 +324,7 @@ def _n_kept(order: Sequence[Any], first: int) -> int:
 
 @contextlib.contextmanager
 def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
-    """Wait until no other run compiles into this folder, to avoid double work; give whether one did."""
+    """Wait until no other run compiles into this folder, to avoid double work; return whether one did."""
     has_waited = False
     try:
         lock = (folder / LOCK_NAME).open("ab")

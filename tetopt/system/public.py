@@ -1,4 +1,4 @@
-"""Checks of the arguments of all public functions by their annotations, with a one-line message for a mistake.
+"""Check the arguments of all public functions by their annotations, with a one-line message for a mistake.
 
 Functions check ranges (which exclude NaN), shapes and consistency themselves. Checking only Images, Meshes and other
 records would take a third of this code, but 227 of the 1505 wrong calls in tests/system/test_public.py would end in an
