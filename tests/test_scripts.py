@@ -117,10 +117,8 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
 def test_curved_cells(tmp_path, monkeypatch):
     """Curved facets are nearer to the sphere, and the volume of its label to that of the voxels."""
     module, out, labels = script("curved_cells"), tmp_path / "curved.json", tmp_path / "labels.nii.gz"
-    monkeypatch.setattr(module, "RADIUS", 8.0)
-    monkeypatch.setattr(module, "HALF", 12)
-    monkeypatch.setattr(module, "NODES", (500,))
-    monkeypatch.setattr(module, "NODES_OF_LABELS", 500)
+    monkeypatch.setattr(module, "NODES", (1_500,))
+    monkeypatch.setattr(module, "NODES_OF_LABELS", 1_500)
     tetopt.save_image(labels, module.sphere())
     module.main([str(labels), "-o", str(out)])
     off, volumes = json.loads(out.read_text()).values()
