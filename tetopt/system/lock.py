@@ -13,7 +13,7 @@ HAS_LOCKS = fcntl is not None
 
 
 def lock_file(stream: IO[Any], *, is_shared: bool = False) -> bool:
-    """Lock an open file until it is closed; return False if another process holds it. Windows has no locks.
+    """Lock an open file until it is closed; return False if another process holds it. Nothing is locked on Windows.
 
     Raises
     ------
