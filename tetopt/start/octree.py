@@ -115,8 +115,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     (303, 3.3)
     """
     content = plain(image)
-    check_enough(content, nodes, sizes)
     limits = _block_limits(content, nodes, sizes)
+    _check_enough(content, nodes, sizes, limits)
     mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
     # Exchanges correct the number within a mask or with targets.
@@ -130,11 +130,17 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
 
 def check_enough(content: Content, nodes: int, sizes: Sizes | None) -> None:
     """Raise InputError for fewer nodes than the sizes need, as `octree_mesh` does."""
-    limits = _block_limits(content, nodes, sizes)
-    by_target = _target_nodes(content, limits)
-    least = max(_fewest_nodes(content, limits), by_target)
+    _check_enough(content, nodes, sizes, _block_limits(content, nodes, sizes))
+
+
+def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
+    """Lower bound of the nodes of an octree of about so many `nodes` that the sizes need."""
+    return _least_and_enough(content, _block_limits(content, nodes, sizes))[0]
+
+
+def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _BlockLimits) -> None:
+    least, enough = _least_and_enough(content, limits)
     if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
-        enough = max(least, SIZED_OVER_EQUILATERAL * by_target)
         if limits.target is None and enough <= prod(content.image.shape):  # count, as the bound is low
             enough = len(_octree_within(content, nodes, limits).points)
         raise InputError(
@@ -143,10 +149,10 @@ def check_enough(content: Content, nodes: int, sizes: Sizes | None) -> None:
         )
 
 
-def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
-    """Lower bound of the nodes of an octree of about so many `nodes` that the sizes need."""
-    limits = _block_limits(content, nodes, sizes)
-    return max(_fewest_nodes(content, limits), _target_nodes(content, limits))
+def _least_and_enough(content: Content, limits: _BlockLimits) -> tuple[float, float]:
+    """Lower bound of the nodes that the limits need, and a number that suffices for targets."""
+    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
+    return max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
 
 
 def _given(content: Content, sizes: Sizes | None) -> str:
