@@ -1,7 +1,9 @@
 """The command with masks, backgrounds, labels and several contrasts."""
 
+import contextlib
 import json
 import re
+import threading
 
 import nibabel
 import numpy as np
@@ -94,7 +96,22 @@ def test_the_numbers(run):
 
 def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
     """Where there is no terminal a line from time to time, of what is read and of the mesh that a run begins with."""
+    waiting, say, is_said = cli_run.waiting, cli_run.log.print, threading.Event()
+
+    def print_line(*words, **options):
+        say(*words, **options)
+        is_said.set()
+
+    @contextlib.contextmanager
+    def until_a_line(words):  # however quick the machine is
+        is_said.clear()
+        with waiting(words):
+            yield
+            assert is_said.wait(60.0)
+
     monkeypatch.setattr(cli_run, "LINE_SECONDS", 0.01)
+    monkeypatch.setattr(cli_run.log, "print", print_line)
+    monkeypatch.setattr(cli_run, "waiting", until_a_line)
     command = ["mesh", inputs / "image.nii.gz", "--mask", inputs / "mask.nii.gz", "--nodes", "600", "--iterations", "0"]
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
     begun, octree, rest = capsys.readouterr().err.partition("octree of ")
