@@ -169,11 +169,14 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
         _keep_each(dual, labels)
     _settle(dual, labels, least, False)
     is_bridge = np.zeros(len(labels), dtype=bool)
+    is_near, is_sound = np.ones((2, len(dual.scale)), dtype=bool)
     for _ in range(MENDING_ROUNDS):
-        moved = _without_fragments(dual, labels, is_bridge, voxel, components)
-        moved += _mended(dual, labels, is_bridge, least)
-        moved += _settle(dual, labels, least, True)
-        if moved == 0:
+        before = labels.copy(), is_bridge.copy()
+        _without_fragments(dual, labels, is_bridge, voxel, components)
+        is_near[:] = True
+        _mend_near(dual, labels, is_bridge, least, is_near, is_sound)
+        _settle(dual, labels, least, True)
+        if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
             break
     _mend_pairs(dual, labels, LAST_FRACTION * least)
     return labels
@@ -650,26 +653,30 @@ def _nonmanifold(
     return np.ascontiguousarray(faces[:, :2]), faces[:, 2] == 2
 
 
-def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64]) -> int:
-    """Mend places that are not manifold if that lowers the energy; return the number of changed cells.
+def _mend_near(
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64],
+    is_near: NDArray[np.bool_], is_sound: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
 
-    Bridges stay, and no label falls below its volume `least`.
+    Bridges stay, and no label falls below its volume `least`. Afterwards no node is marked near; those with a fault
+    there or at an edge, or near a change, are no longer marked sound.
     """
-    total, moved, is_near = 0, 1, None
     room = np.bincount(labels, dual.size, len(least)) - least
-    while moved > 0:
-        faces, is_near = _nonmanifold(dual, labels, is_near)[0], np.zeros(len(dual.scale), dtype=bool)
-        moved = _mend(dual, labels, room, is_bridge, faces, is_near, _work(dual))
-        total += moved
-    return total
+    while is_near.any():
+        faces = _nonmanifold(dual, labels, is_near)[0]
+        is_sound[is_near] = True
+        is_sound[faces[faces >= 0]] = False
+        is_near[:] = False
+        _mend(dual, labels, room, is_bridge, faces, is_near, is_sound, _work(dual))
 
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
     """Mend the remaining places between two labels, even if that removes a bridge."""
     faces, is_two = _nonmanifold(dual, labels)
     room = np.bincount(labels, dual.size, len(least)) - least
-    is_bridge, is_near = np.zeros(len(labels), dtype=bool), np.zeros(len(dual.scale), dtype=bool)
-    _mend(dual, labels, room, is_bridge, faces[is_two], is_near, _work(dual))
+    is_bridge, (is_near, is_sound) = np.zeros(len(labels), dtype=bool), np.zeros((2, len(dual.scale)), dtype=bool)
+    _mend(dual, labels, room, is_bridge, faces[is_two], is_near, is_sound, _work(dual))
 
 
 @entry
@@ -856,13 +863,14 @@ def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
 
 @entry
 def _mend(
-    dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, work: _Work
-) -> int:
+    dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, is_sound: Bools1,
+    work: _Work,
+) -> None:  # fmt: skip
     """At each place that is not manifold, make the move that most lowers the energy including pinches.
 
-    Nodes of changed cells are marked in `is_near`.
+    Nodes of changed cells are marked in `is_near`, and no longer in `is_sound`.
     """
-    total, star, group = 0, np.empty_like(work.star), np.empty_like(work.star)
+    star, group = np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
         a, b = faces[f, 0], faces[f, 1]
         if _fault(dual, labels, a, b, work)[0] == 0.0:
@@ -873,7 +881,7 @@ def _mend(
             size = _group(dual, labels, a, b, star[:count], i, group)
             if size == 0 or room[labels[group[0]]] < dual.size[group[:size]].sum() or is_bridge[group[:size]].any():
                 continue
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, work)
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, is_sound, work)
             if new >= 0:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
@@ -884,9 +892,7 @@ def _mend(
             for cell in group[:size]:
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
-                    is_near[dual.cells[cell, k]] = True
-            total += size
-    return total
+                    is_near[dual.cells[cell, k]], is_sound[dual.cells[cell, k]] = True, False
 
 
 @unit
@@ -917,7 +923,7 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
 
 @unit
 def _best_of_group(
-    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, work: _Work
+    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, is_sound: Bools1, work: _Work
 ) -> tuple[int, float]:
     """The label in the star that lowers the energy most for the group, and the change: below `least`, or -1."""
     old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
@@ -931,7 +937,10 @@ def _best_of_group(
             continue
         if len(faces) == 0:
             faces = _closure(dual, group)
-            before, pinches = _prices(dual, labels, group), _pinches(dual, labels, faces, 0.0, np.inf, work)
+            before, pinches = _prices(dual, labels, group), 0.0
+            for f in range(len(faces)):
+                if not (is_sound[faces[f, 0]] or (faces[f, 1] >= 0 and is_sound[faces[f, 1]])):
+                    pinches += _pinches(dual, labels, faces[f : f + 1], 0.0, np.inf, work)
         for cell in group:
             labels[cell] = new
         change = _prices(dual, labels, group) - before - pinches
