@@ -104,7 +104,7 @@ def _check_options(image: Path | None, compress: float | None, model: ModelOptio
         most = f"{MOST_COMPRESSION_PERCENT:g}"
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
-        raise InputError("`compress` and `loads`: give only one; `loads` compress:5% compresses the box, too")
+        raise InputError("`compress` and `loads`: give only one, as in `loads` compress:5% `loads` pressure:left:1.5")
     if image is None and (lost := [name for name, value in stated_part(part).items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs an IMAGE, got only a mesh")
     if image is None and model.average is not None:
