@@ -171,6 +171,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         ),
         (["{model}", "--compress", "51"], "--compress: expected a percentage above 0 and up to 50, got 51"),
         (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: needs an IMAGE, got only a mesh"),
+        (["{model}", "--registered"], "--registered: needs an IMAGE, got only a mesh"),
         (["{mesh}", "--young", "1=2,*=1", "--load", "compress:5%"], "the mesh has no labels; give the label image"),
         (["{model}", "--labels", "half.nii"], "half.nii: labels must be whole numbers from 0"),
         (["{model}", "--labels", "plane.nii"], "plane.nii: expected 3-D labels like the mesh, got a 2-D image"),

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import in_box, is_same_grid, other_box, resample_contrast
+from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS, in_box, is_same_grid, other_box, resample_contrast
 from tetopt.contents.content import SMOOTH_INTERFACES
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
@@ -255,10 +255,23 @@ def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
     return table if isinstance(table, dict) else {}
 
 
-def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:
-    """Warn if the mesh's file names another source image than this one; return whether it does."""
-    made_from = loaded.text("image_sha256")
+def warn_of_other_image(
+    loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image | None = None, *, is_exact: bool = False
+) -> bool:
+    """Warn if the mesh's file names another source image than this one; return whether it does.
+
+    Reject such an `image`, if given, unless it has the source's box to a voxel; with `is_exact`, reject any image with
+    another box.
+    """
+    made_from, box = loaded.text("image_sha256"), loaded.box
     is_other = made_from is not None and made_from != sha256(image_path)
+    if image is not None and box is not None and len(box.shape) == image.ndim and (is_other or is_exact):
+        tolerance, remedy = SAME_BOX_VOXELS, "if it is registered to that image of the same subject, pass `registered`"
+        if is_exact:
+            tolerance, remedy = SAME_GRID_VOXELS, "`check` needs that image, with its crop"
+        if words := other_box(box, image, tolerance):
+            name = f"{mesh_path}'s image, {loaded.text('image')}"
+            raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
     if is_other:
         warning(f"{mesh_path} was built from a different image, not {image_path}")
     return is_other
