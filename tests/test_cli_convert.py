@@ -412,6 +412,19 @@ def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path,
     assert "no node lies in the image's box" in capsys.readouterr().err
 
 
+def test_values_of_labels_that_no_cell_has_are_said(folder, tmp_path, capsys):
+    """Once for each quantity, and in a run only of the final mesh."""
+    mapping = ["--young", "1=2,9=5,*=1", "--nu", "7=0.4,9=0.3,*=0.2"]
+    mesh = [*labelled_lattice_words(tmp_path), "-o", tmp_path / "m.inp"]
+    for words in (["convert", folder / "a.vtu", tmp_path / "a.inp"], ["fem", folder / "a.vtu"], mesh):
+        assert exit_code(*words, *mapping, "--load", "compress:1%") == 0
+        said = re.findall("warning: (values by label: .*)", capsys.readouterr().err)
+        assert said == [
+            "values by label: no cell has label 9 (1 of 2); the mesh has 0, 1",
+            "values by label: no cell has label 7, 9 (2 of 2); the mesh has 0, 1",
+        ]
+
+
 def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path, capsys):
     options = ["--spacing", "8", "--iterations", "1", "--young", "3", "--set", "p=point:0,0,0:0.01"]
     assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options) == 2

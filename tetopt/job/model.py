@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -271,7 +272,9 @@ def check_early(
     check_steps(loads)
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
-    model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
+    with warnings.catch_warnings():  # the final mesh may have cells of further labels
+        warnings.filterwarnings("ignore", "values by label: no cell has")
+        model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
     for request in requests:
         check_free_names(request, model.sets)
