@@ -799,12 +799,20 @@ def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
 def test_quality_with_another_image(tmp_path, inputs, capsys):
     command = small_run(inputs, tmp_path, 0)
     assert exit_code(*command) == 0
-    save_image(tmp_path / "other.nii", load_phantom("two_spheres").image(voxel_mm=8.0))
+    other = load_phantom("two_spheres").image(voxel_mm=8.0)
+    save_image(tmp_path / "other.nii", other)
+    save_image(tmp_path / "crop.nii", Image(other.data[:-1], other.affine))
     capsys.readouterr()
     assert exit_code("quality", tmp_path / "a.vtu", "--image", inputs / "sphere.nii.gz") == 0
     assert capsys.readouterr().err == ""
     assert exit_code("quality", tmp_path / "a.vtu", "--image", tmp_path / "other.nii") == 0
     assert "a.vtu was built from a different image" in capsys.readouterr().err
+    for words in ([tmp_path / "crop.nii"], [inputs / "sphere.nii.gz", "--crop", "1:,:,:"]):
+        assert exit_code("quality", tmp_path / "a.vtu", "--check", "--image", *words) == 2
+        said = capsys.readouterr().err
+        assert "expected the box of" in said
+        assert "--check needs that image, with its crop" in said
+        assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize("part", [["--slice", "k=4"], ["--crop", "1:7,:,2:"]])

@@ -386,6 +386,45 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
     assert means[1].max() < 30
 
 
+def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path, capsys):
+    """A finer grid of the same box is another contrast; more of the world may be another subject."""
+    image = tetopt.load_image(folder / "a.nii.gz")
+    grids = {"finer": (0.5, 0.0), "moved": (1.0, 2.0), "far": (1.0, 99.0)}
+    for name, (step, shift) in grids.items():
+        data = np.repeat(image.data, round(1 / step), axis=0)
+        affine = image.affine @ np.diag([step, 1.0, 1.0, 1.0])
+        affine[:3, 3] = image.to_world([0.5 * step - 0.5 + shift, 0.0, 0.0])
+        tetopt.save_image(tmp_path / f"{name}.nii", tetopt.Image(data, affine))
+    mapping = ["--young", MAPPING]
+    convert = ["convert", folder / "a.vtu", tmp_path / "a.inp", *mapping, "--force", "--image"]
+    assert exit_code(*convert, tmp_path / "finer.nii") == 0
+    assert "a.vtu was built from a different image" in capsys.readouterr().err
+    expected = r"tetopt: .*moved.nii: expected the box of .*a.vtu's image, a.nii.gz, .* mm, got .* pass --registered\n"
+    fem = ["fem", tmp_path / "moved.nii", folder / "a.vtu", *mapping, "--load", "compress:1%"]
+    for words in ([*convert, tmp_path / "moved.nii"], fem):
+        assert exit_code(*words) == 2
+        assert re.fullmatch(expected, capsys.readouterr().err)
+        assert exit_code(*words, "--registered") == 0
+        said = capsys.readouterr().err
+        assert "a.vtu was built from a different image" in said
+        assert "% of the nodes lie outside the image: cells there take the nearest voxel's value" in said
+    assert exit_code(*convert, tmp_path / "far.nii", "--registered") == 2
+    assert "no node lies in the image's box" in capsys.readouterr().err
+
+
+def test_values_of_labels_that_no_cell_has_are_said(folder, tmp_path, capsys):
+    """Once for each quantity, and in a run only of the final mesh."""
+    mapping = ["--young", "1=2,9=5,*=1", "--nu", "7=0.4,9=0.3,*=0.2"]
+    mesh = [*labelled_lattice_words(tmp_path), "-o", tmp_path / "m.inp"]
+    for words in (["convert", folder / "a.vtu", tmp_path / "a.inp"], ["fem", folder / "a.vtu"], mesh):
+        assert exit_code(*words, *mapping, "--load", "compress:1%") == 0
+        said = re.findall("warning: (values by label: .*)", capsys.readouterr().err)
+        assert said == [
+            "values by label: no cell has label 9 (1 of 2); the mesh has 0, 1",
+            "values by label: no cell has label 7, 9 (2 of 2); the mesh has 0, 1",
+        ]
+
+
 def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path, capsys):
     options = ["--spacing", "8", "--iterations", "1", "--young", "3", "--set", "p=point:0,0,0:0.01"]
     assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options) == 2
@@ -502,6 +541,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--nu", "0.3"], "--nu: needs --young"),
         ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: needs --image"),
+        ("a.inp", ["--registered"], "--registered: needs --image"),
         ("a.inp", ["--young", "2", "--load", "gravity:0,0,-9810"], "gravity: the cells have no density"),
         ("a.vtu", ["--young", "2", "--nonlinear"], "--nonlinear is for .inp, .feb only"),
         ("a.inp", ["--young", "2", "--load", "pressure:nowhere:1"], 'no set of facets "nowhere"'),

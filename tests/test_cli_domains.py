@@ -257,7 +257,7 @@ def test_a_slice_of_a_mask_that_is_stored_upside_down(inputs, tmp_path):
 
 
 def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
-    """And so is a mask of which half lies elsewhere."""
+    """And so are a mask of which half lies elsewhere, and one of the image's shape that is a little off."""
     image, mask = shaped("ball", OBLIQUE)
     moved = OBLIQUE.copy()
     moved[:3, 3] = image.to_world([14.0, 0.0, 0.0])
@@ -267,7 +267,34 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "square.nii.gz: resampled to the image's grid (linear)" in said
     assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
-    assert "% of it lies within the image; is it from the same scan?" in said
+    assert "half.nii.gz: 48.7% of it lies outside the image, of which its box covers 50.0%" in said
+    assert "(same shape, other affine); is it from the same scan?" in said
+    moved[:3, 3] = image.to_world([1.5, 0.0, 0.0])
+    tetopt.save_image(tmp_path / "near.nii.gz", tetopt.Image(mask.data, moved))
+    command = [
+        "mesh",
+        inputs / "image.nii.gz",
+        "--nodes",
+        "300",
+        "--iterations",
+        "0",
+        "--force",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
+    exit_code(*command, "--mask", tmp_path / "near.nii.gz")
+    assert "near.nii.gz: 0.0% of it lies outside the image" in capsys.readouterr().err
+    wide = OBLIQUE.copy()  # the same space: more of it, and its axes the other way
+    wide[:3, 3] = image.to_world([-3.0, -3.0, -3.0])
+    tetopt.save_image(tmp_path / "wide.nii.gz", tetopt.Image(np.pad(mask.data, 3, constant_values=1.0), wide))
+    turned = OBLIQUE @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    turned[:3, 3] = image.to_world([image.shape[0] - 1.0, 0.0, 0.0])
+    tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[::-1], turned))
+    for name in ("wide", "turned"):
+        exit_code(*command, "--mask", tmp_path / f"{name}.nii.gz")
+        said = capsys.readouterr().err
+        assert f"{name}.nii.gz: resampled" in " ".join(said.split())
+        assert "same scan" not in said
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):

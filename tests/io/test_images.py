@@ -458,7 +458,7 @@ def test_missing_dicom_slice(tmp_path, sitk):
 def test_uneven_dicom_slices_in_words():
     points = np.column_stack([np.zeros(5), [0.0, 1.0, 2.0, 1.0, 0.0], 3.0 * np.arange(5)])  # even, but not on a line
     off = np.abs(points[:, 1])
-    assert _unevenness(points, off) == "slice 2, counted from 0, is 2 mm off its evenly spaced position"
+    assert _unevenness(points, off) == "slice 2, counted from 0, is 2 mm off its even place between first and last"
     points = np.outer([0.0, 3.0, 6.0, 9.0, 15.0, 24.0, 27.0], [0.0, 0.0, 1.0])
     assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(points, off)
 

@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,7 +104,9 @@ def test_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pytetwild", None)
     with pytest.raises(NotInstalled, match=r"pytetwild: not installed; .* pip install"):
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
-    monkeypatch.setattr(tetwild.importlib, "import_module", lambda name: __import__("tetopt_has_no_such_package"))
+    # In this module alone: tetopt's own names are imported lazily, by the same function.
+    broken = SimpleNamespace(import_module=lambda name: __import__("tetopt_has_no_such_package"))
+    monkeypatch.setattr(tetwild, "importlib", broken)
     with pytest.raises(tetopt.InputError, match=r"pytetwild: cannot be imported \(No module .* pip install") as error:
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     assert not isinstance(error.value, NotInstalled)

@@ -26,8 +26,8 @@ def quality_command(
         bool,
         Option(
             None,
-            "Check for a valid mesh with a manifold boundary and, with `image`, that it fills the box and meets its "
-            "run's requirements; exit 1 if not.",
+            "Check for a valid mesh with a manifold boundary and, with the `image` of its run, that it fills the box "
+            "and meets the run's requirements; exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,

@@ -7,6 +7,7 @@ their shapes. The domain of a grid is the box of its voxels, from index -0.5 to 
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy
@@ -16,10 +17,11 @@ from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
-from tetopt.geometry.box import box_sides
-from tetopt.image import Image
+from tetopt.geometry.box import box_sides, is_on_sides
+from tetopt.image import Image, transformed
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
+SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole voxels
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
 BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median, up to which voxels count as background
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
@@ -149,7 +151,7 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     _check_axes(name, other, image)
     if is_same_grid(other, image):
         return Image(other.data, image.affine)
-    fraction = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
+    fraction = float(in_box(other, image).mean())
     if fraction < LEAST_COVERED_FRACTION:
         raise InputError(
             f"{name}: expected to cover half of the image's voxels or more, got {100 * fraction:.1f} %; "
@@ -290,6 +292,20 @@ def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> boo
     )
 
 
+def other_box(grid: Any, image: Image, tolerance: float = SAME_BOX_VOXELS) -> str:
+    """Return "A mm, got B mm", the extents of a grid's box and an image's, if these are different boxes, else "".
+
+    The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels, in any order of the axes.
+    """
+    is_near = is_on_sides(image.to_index(_world_corners(grid)), box_sides(image.shape), tolerance)
+    return "" if is_near.any(axis=-1).all() else f"{_extent(grid)} mm, got {_extent(image)} mm"
+
+
+def in_box(other: Image, image: Image) -> NDArray[np.uint8]:
+    """1 at the image's voxel centres in the box of `other`, else 0, in the image's shape."""
+    return _resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant")
+
+
 def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
     """`data`, on the grid of `other`, at the image's voxel centres.
 
@@ -303,17 +319,21 @@ def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str)
     return scipy.ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
 
 
-def _corners(image: Image) -> NDArray[np.float64]:
-    """The corners of the image's box, (2^n, n) indices."""
-    return np.array(list(product(*box_sides(image.shape))))
+def _corners(grid: Any) -> NDArray[np.float64]:
+    """The corners of a grid's box, (2^n, n) indices."""
+    return np.array(list(product(*box_sides(grid.shape))))
 
 
 def _both_boxes(other: Image, image: Image) -> str:
     return f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both use the same world coordinates?"
 
 
-def _extent(image: Image) -> str:
-    world = image.to_world(_corners(image))
+def _world_corners(grid: Any) -> NDArray[np.float64]:
+    return transformed(_corners(grid), grid.affine[:-1, :-1]) + grid.affine[:-1, -1]
+
+
+def _extent(grid: Any) -> str:
+    world = _world_corners(grid)
     return " x ".join(f"{a:.1f}..{b:.1f}" for a, b in zip(world.min(axis=0), world.max(axis=0), strict=True))
 
 

@@ -180,7 +180,7 @@ def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
     usual = float(np.median(steps))
     is_other = np.abs(steps - usual) > _UNEVEN_FRACTION * usual
     if not is_other.any():
-        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its evenly spaced position"
+        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its even place between first and last"
     k = int(np.abs(steps - usual).argmax())
     where = "elsewhere" if is_other.sum() == 1 else "at most places"
     return (

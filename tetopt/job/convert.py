@@ -30,7 +30,7 @@ from tetopt.job.model import (
     with_chosen_sets,
     without_stale_results,
 )
-from tetopt.job.options import ImagePart, LabelledPart, SolverOptions
+from tetopt.job.options import ImagePart, LabelledPart, SolverOptions, stated_part
 from tetopt.model.fields import is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile, without_results
 from tetopt.model.model import Model
@@ -72,7 +72,7 @@ def convert_file(
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
         raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
-    needs_image = {"mask": mask, "volume": part.volume, "crop": part.crop, "slice": part.slice_}
+    needs_image = {"mask": mask, **stated_part(part), "registered": part.registered or None}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs `image`")
     loaded = read_mesh(mesh)
@@ -89,7 +89,7 @@ def convert_file(
     voxels: Image | None = None
     if image is not None:
         whole, voxels = _images(image, mask, part, loaded.mesh.ndim)
-        if warn_of_other_image(loaded, mesh, image):
+        if warn_of_other_image(loaded, mesh, image, None if part.registered else whole):
             about = {}
         box = box_of(whole) if box is None else box
         about |= {"image": image.name, "image_sha256": sha256(image)}

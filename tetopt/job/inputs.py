@@ -13,8 +13,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import is_same_grid, resample_contrast
+from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS, in_box, is_same_grid, other_box, resample_contrast
 from tetopt.contents.content import SMOOTH_INTERFACES
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError
@@ -32,7 +33,7 @@ from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
 from tetopt.system.incoming import json_of, rows_of
 
-IN_IMAGE_FRACTION = 0.95  # of a mask's or labels' volume: grids' differences do not explain less in the image
+OUTSIDE_FRACTION = 0.02  # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
 NAMES_LISTED = 8  # as many as fit on a line
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
@@ -98,14 +99,20 @@ def image_and_others(
 
 
 def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
-    """Report that a file was resampled, and, unless cropped, how much of a mask or labels lies in the image."""
-    if is_contrast:
-        note(f"{path}: resampled to the image's grid (linear)")
+    """Report that a file was resampled; warn of a mask or labels that seem to be of another scan.
+
+    These are cut by the image's box, though the image is no crop of them, or have its shape in another place.
+    """
+    note(f"{path}: resampled to the image's grid ({'linear' if is_contrast else 'nearest neighbour'})")
+    if is_contrast or is_cropped or is_same_grid(original, moved, is_cropped=True):
         return
-    whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
-    note(f"{path}: resampled to the image's grid (nearest neighbour)")
-    if not is_cropped and inside < IN_IMAGE_FRACTION * whole:
-        warning(f"{path}: only {inside / whole:.0%} of it lies within the image; is it from the same scan?")
+    outside = 1.0 - float(in_box(moved, original)[original.data >= min(INSIDE_FRACTION, original.data.max())].mean())
+    is_moved = original.shape == moved.shape and bool(other_box(original, moved))
+    if is_moved or outside > OUTSIDE_FRACTION:
+        warning(
+            f"{path}: {outside:.1%} of it lies outside the image, of which its box covers "
+            f"{in_box(original, moved).mean():.1%} ({'same shape, ' * is_moved}other affine); is it from the same scan?"
+        )
 
 
 def read_companion(path: Path) -> Image:
@@ -248,10 +255,23 @@ def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
     return table if isinstance(table, dict) else {}
 
 
-def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:
-    """Warn if the mesh's file names another source image than this one; return whether it does."""
-    made_from = loaded.text("image_sha256")
+def warn_of_other_image(
+    loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image | None = None, *, is_exact: bool = False
+) -> bool:
+    """Warn if the mesh's file names another source image than this one; return whether it does.
+
+    Reject such an `image`, if given, unless it has the source's box to a voxel; with `is_exact`, reject any image with
+    another box.
+    """
+    made_from, box = loaded.text("image_sha256"), loaded.box
     is_other = made_from is not None and made_from != sha256(image_path)
+    if image is not None and box is not None and len(box.shape) == image.ndim and (is_other or is_exact):
+        tolerance, remedy = SAME_BOX_VOXELS, "if it is registered to that image of the same subject, pass `registered`"
+        if is_exact:
+            tolerance, remedy = SAME_GRID_VOXELS, "`check` needs that image, with its crop"
+        if words := other_box(box, image, tolerance):
+            name = f"{mesh_path}'s image, {loaded.text('image')}"
+            raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
     if is_other:
         warning(f"{mesh_path} was built from a different image, not {image_path}")
     return is_other

@@ -103,7 +103,8 @@ def judge(
     Raises
     ------
     InputError
-        Files cannot be read, or the files that they belong to are missing.
+        Files cannot be read, or the files that they belong to are missing; with `check`, the image has another box
+        than that of the mesh's run.
     """
     if image is None and (mask is not None or labels is not None):
         raise InputError("`mask` and `labels`: need an `image`, on whose voxels they are compared")
@@ -116,10 +117,11 @@ def judge(
         numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
-        judgement = judgement._replace(source=_source(loaded, image, mask, labels, part))
+        source = _source(loaded, image, mask, labels, part)
+        warn_of_other_image(loaded, mesh, image, source.contrasts[0] if check else None, is_exact=check)
+        judgement = judgement._replace(source=source)
         fit, result, measured = _measured(judgement)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
-        warn_of_other_image(loaded, mesh, image)
         numbers |= {**measured, "image": image.name, "fit": fit}
         judgement = judgement._replace(fit=fit, result=result, measured=measured)
     if check:

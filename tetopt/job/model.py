@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.errors import InputError, error_words
+from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
@@ -233,6 +235,10 @@ def model_of_file(
 ) -> Model:  # fmt: skip
     """Build the model of a mesh's file, keeping the file's own data, with the options; warn of implausible units."""
     mesh, fields = loaded.mesh, loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image))
+    if image is not None and (outside := float((beyond_box(mesh, image) > 1.0).mean())) > 0.0:
+        if outside == 1.0:
+            raise InputError("mesh and image: no node lies in the image's box; are both in the same world mm?")
+        warning(f"{outside:.1%} of the nodes lie outside the image: cells there take the nearest voxel's value")
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
     sets = all_sets(mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
@@ -266,7 +272,9 @@ def check_early(
     check_steps(loads)
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
-    model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
+    with warnings.catch_warnings():  # the final mesh may have cells of further labels
+        warnings.filterwarnings("ignore", "values by label: no cell has")
+        model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
     for request in requests:
         check_free_names(request, model.sets)

@@ -88,6 +88,9 @@ class LabelledPart(ImagePart):
         Path | None,
         Option("LABELS", "Label image: each cell gets its voxels' majority label, for modulus mappings and sets."),
     ] = None
+    registered: Annotated[
+        bool, Option(None, "Accept another image than the mesh's, registered to it, though its box differs.")
+    ] = False
 
 
 WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()

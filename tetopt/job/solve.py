@@ -21,7 +21,7 @@ from tetopt.job.model import (
     model_of_file,
     with_chosen_sets,
 )
-from tetopt.job.options import ImagePart, LabelledPart, ModelOptions, stated_part
+from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.file import MeshFile, without_results
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
@@ -79,7 +79,7 @@ def solve_file(
     voxels = None if image is None else read_image(image, part)
     loaded = with_labels(without_results(read_mesh(mesh)), part.labels)
     if image is not None:
-        warn_of_other_image(loaded, mesh, image)
+        warn_of_other_image(loaded, mesh, image, None if part.registered else voxels)
     of_box = voxels is not None and not model.loads
     if voxels is not None and of_box:
         _check_box(voxels, loaded)
@@ -98,14 +98,15 @@ def solve_file(
     return SolvedModel(task, model, solutions, extremes, numbers)
 
 
-def _check_options(image: Path | None, compress: float | None, model: ModelOptions, part: ImagePart) -> None:
+def _check_options(image: Path | None, compress: float | None, model: ModelOptions, part: LabelledPart) -> None:
     """Raise InputError for options that are invalid for any file."""
     if compress is not None and not 0.0 < compress <= MOST_COMPRESSION_PERCENT:
         most = f"{MOST_COMPRESSION_PERCENT:g}"
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
-        raise InputError("`compress` and `loads`: give only one; `loads` compress:5% compresses the box, too")
-    if image is None and (lost := [name for name, value in stated_part(part).items() if value is not None]):
+        raise InputError("`compress` and `loads`: give only one, as in `loads` compress:5% `loads` pressure:left:1.5")
+    needs_image = {**stated_part(part), "registered": part.registered or None}
+    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs an IMAGE, got only a mesh")
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass the IMAGE before the MESH")

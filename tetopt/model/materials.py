@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.sampling import ranges_of
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.mappings import ByLabel, checked_young
 
 DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
+LABELS_LISTED = 8  # of labels without cells, in a message
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)
 
@@ -173,6 +174,9 @@ def by_label(
                 raise InputError(f"values by label: label {label_words(label, names)} has two values; give only one")
             values[label] = value
     kinds, which = np.unique(labels, return_inverse=True)
+    if unused := [label_words(label, names) for label in values if label not in kinds]:
+        few, own = (", ".join(map(str, each[:LABELS_LISTED])) for each in (unused, kinds))
+        warn(f"values by label: no cell has label {few} ({len(unused)} of {len(values)}); the mesh has {own}")
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
     if missing and mapping.rest is None:
         raise InputError(
