@@ -128,6 +128,14 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     )
 
 
+def check_octree(content: Content, nodes: int, sizes: Sizes | None) -> None:
+    """Raise InputError as `octree_mesh`; build it only if its number of nodes matters: without targets and masks."""
+    limits = _block_limits(content, nodes, sizes)
+    _check_enough(content, nodes, sizes, limits)
+    if limits.target is None and content.inside is None:
+        octree_mesh(content, nodes, sizes)
+
+
 def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
     """Number of nodes of the coarsest octree that `nearest_octree` can make; an estimate for targets and in masks.
 
