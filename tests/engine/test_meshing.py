@@ -78,6 +78,29 @@ def test_a_lattice_for_order_2():
     assert abs(len(quadratic(result.mesh.points, result.mesh.cells)[0]) / 1200 - 1.0) < 0.2
 
 
+@pytest.mark.parametrize(
+    ("options", "n_runs"),
+    [
+        ({"nodes": 700, "sizes": tetopt.Sizes(longest=20.0)}, 1),
+        ({"nodes": 3000, "sizes": tetopt.Sizes(smallest=12.0)}, 1),
+        ({"nodes": 1200, "mode": "uniform"}, 2),
+        ({"target_error": 0.5, "sizes": tetopt.Sizes(longest=6.0), "order": 1}, 1),
+    ],
+)
+def test_no_run_is_repeated(options, n_runs):
+    """Where limits on sizes, or the steps of lattices, make the same mesh of another number, within a mask as well."""
+    seen = []
+    image = tetopt.content(IMAGE, mask=MASK) if "target_error" in options else IMAGE
+
+    def watch(initial, run):
+        seen.append(run())
+        return seen[-1]
+
+    result = tetopt.mesh_image(image, **{"order": 2, "iterations": 2, "watch": watch} | options)
+    assert len(seen) == n_runs
+    assert result.mesh.points.tobytes() == seen[-1].mesh.points.tobytes()
+
+
 def test_longest_edge_of_order_2():
     """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for stays."""
     content = plain(IMAGE)

@@ -30,7 +30,7 @@ def test_values_are_brought_to_the_kinds_of_their_options():
     ({"nodes": True}, "`nodes`: expected a whole number, got True"),
     ({"nodes": 2**63}, "`nodes`: expected a whole number, got 9223372036854775808"),
     ({"nodes": float("inf")}, "`nodes`: expected a whole number, got inf"),
-    ({"nodes": 3}, "`nodes`: expected a whole number, 5 or more, got 3"),
+    ({"nodes": 3}, "`nodes`: expected a whole number from 5 to 50000000, got 3"),
     ({"k_D": 2}, "`k_D`: expected 0 <= k_D < 1, got 2.0"),
     ({"iterations": -1}, "`iterations`: expected 0 or more, got -1"),
     ({"images": []}, r"`images`: expected a path or a list of them, got \[\]"),

@@ -16,6 +16,7 @@ from tetopt.engine import cost
 from tetopt.engine.cost import RunSize
 from tetopt.job import predict
 from tetopt.job.plan import plan
+from tetopt.start.octree import nearest_octree
 from tetopt.system.interpreter import python_command, python_environment
 
 
@@ -71,9 +72,39 @@ def test_what_a_run_refuses_its_prediction_does(image_path, tmp_path, capsys):
 
 def test_a_target_error_with_limits_on_sizes_needs_their_nodes(image_path, tmp_path, sizes):
     """The prediction is for the nodes of the first octree, more than the default."""
-    words = mesh_words(image_path, tmp_path, "--predict", "--target-error", "0.5", "--edge-max", "1.2")
+    words = mesh_words(image_path, tmp_path, "--predict", "--target-error", "0.5", "--edge-max", "2.1")
     assert exit_code(*words) == 0
-    assert sizes[0].n_nodes > 5_000
+    octree = nearest_octree(sample_image(3), 1500, tetopt.Sizes(longest=2.1))
+    assert sizes[0].n_nodes == len(octree.points) > 5_000
+
+
+@pytest.mark.parametrize(
+    "options",
+    ["--nodes 500", "--nodes 300 --size-min 8", "--slice k=3 --nodes 500", "--parts 2 --nodes 2000",
+     "--target-error 0.5 --edge-max 1.2", "--order 2 --nodes 720 --edge-max 0.4", "--nodes 50 --edge-max 0.4"],
+)  # fmt: skip
+def test_numbers_and_sizes_that_a_run_refuses(image_path, tmp_path, capsys, options):
+    """The prediction refuses the same, in the same words."""
+    words = mesh_words(image_path, tmp_path, *options.split())
+    assert exit_code(*words) == exit_code(*words, "--predict") == 2
+    run, prediction = (line for line in capsys.readouterr().err.splitlines() if line.startswith("tetopt: "))
+    assert run == prediction
+
+
+def test_sizes_of_order_2_need_their_nodes(image_path, tmp_path, sizes):
+    """A run accepts them, with more corners than requested and without a second run; a spacing has its own number."""
+    field = tetopt.Image(np.full((9, 8, 7), 3.0), sample_image(3).affine)
+    tetopt.save_image(tmp_path / "f.nii.gz", field)
+    words = mesh_words(image_path, tmp_path, "--predict", "--order", "2")
+    for options in (["--edge-max", "5"], ["--sizing", tmp_path / "f.nii.gz"], ["--edge-size", "3"]):
+        assert exit_code(*words, "--nodes", "720", *options) == 0
+    assert exit_code(*words, "--spacing", "8") == exit_code(*words, "--spacing", "8", "--order", "1") == 0
+    longest, *targets, quadratic, linear = sizes
+    assert longest.n_nodes == len(nearest_octree(sample_image(3), 100, tetopt.Sizes(longest=5.0, gradation=0.5)).points)
+    octree = nearest_octree(sample_image(3), 100, tetopt.Sizes(edge_size=3.0, gradation=0.5))
+    assert [each.n_nodes for each in targets] == [pytest.approx(len(octree.points), rel=0.3)] * 2
+    assert [each.runs for each in sizes] == [1] * 5
+    assert quadratic.n_nodes == linear.n_nodes
 
 
 def test_sizes_of_what_was_read(image_path, tmp_path, sizes):

@@ -10,8 +10,10 @@ from scipy.sparse.csgraph import dijkstra
 from test_octree import OBLIQUE, ball, grid
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.engine.meshing import meshed_to_error
-from tetopt.start.octree import _Blocks, _divided, nodes_of_sizes, octree_mesh
+from tetopt.start import octree
+from tetopt.start.octree import _Blocks, _divided, least_nodes, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
 
 
@@ -284,6 +286,25 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
     assert len(tetopt.octree_mesh(image, nodes, sizes).points) > 0.5 * nodes
 
 
+@pytest.mark.parametrize("sizes", [Sizes(longest=4.0), Sizes(longest=7.0, gradation=0.2)])
+def test_the_coarsest_octree_is_counted_without_blocks(monkeypatch, sizes):
+    """To the last node in a box, anisotropic as well; in a mask about."""
+    image = ball(30, 24, 14, affine=np.diag([1.0, 1.0, 2.0, 1.0]))
+    content = tetopt.content(image, mask=tetopt.Image(1.0 * (image.data > 50), image.affine))
+    count, within = (len(nearest_octree(each, 60, sizes).points) for each in (image, content))
+    monkeypatch.setattr(octree, "_blocks_by_depth", None)
+    assert least_nodes(plain(image), 60, sizes) == count > 100
+    assert 0.5 * within < least_nodes(content, 60, sizes) < 1.1 * within
+    with pytest.raises(tetopt.InputError, match=f"they need at least .*; use {count}, or allow longer edges"):
+        octree_mesh(image, 60, sizes)
+
+
+def test_the_longest_edge_of_any_number_of_nodes():
+    """In a small mask the lattice of the box has more than lattices may."""
+    image = ball(30, 30, 30)
+    assert Sizes().longest_edge(image, 10**6, image.volume / 1000.0) > 0.0
+
+
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [
@@ -291,14 +312,14 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
         (Sizes(edge_size=float("nan")), "edge_size: expected a length above 0 mm"),
         (Sizes(longest=0.0), "longest: expected a length above 0 mm"),
         (Sizes(smallest=5.0, longest=4.0), "longest: 4 mm is below the smallest size, 5 mm"),
-        (Sizes(longest=0.3), "500 nodes are too few .* they need"),
+        (Sizes(longest=0.3), "cells are smaller than voxels"),
         (Sizes(smallest=5.0, edge_size=4.0), "edge_size: 4 mm is below the smallest size, 5 mm"),
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
         (Sizes(field=tetopt.Image(np.ones((4, 4)))), "field: expected a 3-D field"),
         (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "field: expected lengths above 0 mm"),
         (Sizes(smallest=100.0), "smallest: 100 mm is longer than the box, 30 mm"),
-        (Sizes(edge_size=1e-6), "500 nodes are too few .* they need"),
-        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
+        (Sizes(edge_size=1e-6), "cells are smaller than voxels"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "cells are smaller than voxels"),
         (
             Sizes(field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))),
             "no voxel above 0",

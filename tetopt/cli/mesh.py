@@ -23,7 +23,7 @@ from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
-from tetopt.start.octree import check_enough
+from tetopt.start.octree import check_octree
 from tetopt.system.files import results_folder
 
 
@@ -43,8 +43,8 @@ def _predict(job: Job, display: Display) -> int:
     with listened(display):
         task = read(job)
         display.end_stage()
-    if task.plan.mode == "graded" and task.plan.job.target_error is None and task.plan.order == 1:
-        check_enough(task.source.content, task.size.n_nodes, task.sizes)
+    if task.plan.mode == "graded" and task.plan.job.nodes is not None and task.plan.order == 1:
+        check_octree(task.source.content, task.plan.job.nodes, task.sizes)
     task.plan.division.chosen(print_prediction, print_parts)(task)
     return 0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Annotated, Any, cast, get_args, get_type_hints
 import typer
 
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
-from tetopt.errors import InputError
+from tetopt.job.job import of_option
 from tetopt.job.options import (
     IMAGE_FILES,
     ForceOption,
@@ -29,7 +30,6 @@ from tetopt.job.options import (
     option_of,
 )
 from tetopt.system.files import checked_output, name_files, save_json
-from tetopt.system.public import LARGEST_INTEGER
 
 ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
@@ -86,9 +86,11 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     @wraps(command)
     def called(**values: Any) -> int:
         name_files(values.values())
-        for name, value in values.items():
-            if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-                raise InputError(f"{name.replace('_', '-')}: expected a number of 64 bits, got a larger one")
+        for name, kind, *_ in leaves:
+            if (own := _number_of(kind)) is not None:
+                with suppress(ValueError, TypeError):  # of a text, which is rejected next, or of None
+                    values[name] = own(values[name])
+                values[name] = of_option(name, kind, values[name])
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     leaves = [each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)]
@@ -130,7 +132,13 @@ def _typed(name: str, kind: Any, panel: str | None) -> Any:
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
     names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
+    about["parser"] = str if _number_of(kind) else None  # `of_option` has plainer words for what is none
     return Annotated[get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
+
+
+def _number_of(kind: Any) -> type[int] | type[float] | None:
+    """Return the type of a number's option; None for other options and parameters."""
+    return next((own for own in (int, float) if has_option(kind) and get_args(kind)[0] in (own, own | None)), None)
 
 
 def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:

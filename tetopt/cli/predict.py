@@ -41,7 +41,7 @@ def _seconds(value: float) -> str:
 
 def print_parts(task: Task) -> None:
     """Print the expected number of parts and the memory of each."""
-    job, nodes = task.plan.job, task.size.n_nodes
+    job, nodes = task.plan.job, task.plan.job.nodes or 0
     number, n_bytes = task.plan.division.expected(task.source.contrasts[0], nodes)
     need = Need(number, n_bytes, job.threads, is_within=True)
     own = OCTREE_NODE_BYTES * nodes

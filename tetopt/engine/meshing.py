@@ -16,6 +16,7 @@ from math import prod
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.engine.cost import meshing_bytes
@@ -46,6 +47,7 @@ from tetopt.start.sizes import Sizes
 from tetopt.system.budget import check_memory
 
 Mode = Literal["graded", "uniform", "paper", "start"]
+EarlierRuns = list[tuple[NDArray, int, int]]  # points of the initial mesh, and nodes requested and reached
 Run = Callable[..., MeshingResult]  # an optimisation ready to start; takes further options of `optimize`
 
 
@@ -213,20 +215,20 @@ def mesh_image(
         seconds.append(time.perf_counter() - start_of_run)
         return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
 
-    def begun(corners: int | None) -> MeshingResult:
+    def begun(corners: int | None) -> Mesh:
         if mode == "graded":
             # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as many as they can.
-            return run((octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes), corners)
-        return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
+            return (octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes)
+        return lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing)
 
     if target_error is not None:
         result = meshed_to_error(content, target_error, sizes, run)
     elif start is not None:
         result = run(start, None)
     elif order == 2 and nodes is not None:
-        result = meshed_in_all(content.image.ndim, nodes, begun)
+        result = meshed_in_all(content.image.ndim, nodes, begun, run, has_exchanges=mode == "graded")
     else:
-        result = begun(nodes)
+        result = run(begun(nodes), nodes)
     result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
     if order == 2:
         result = _curved(result, content)
@@ -344,18 +346,36 @@ def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, ord
     return sizes._replace(longest=sizes.longest_edge(content.image, corners, content.volume))
 
 
-def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) -> MeshingResult:
+def corners_of(nodes: int, ndim: int, ratio: float) -> int:
+    """Number of corners to request for `nodes` in all of order 2, `ratio` times as many."""
+    return max(round(nodes / ratio), 2 ** (ndim + 1))
+
+
+def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bool = True) -> bool:
+    """True if a run would end as an earlier one: the same initial mesh, and exchanges, if any, cannot come nearer."""
+    for points, earlier, reached in runs:
+        low, high = (1.0 - NODES_NEAR) * min(earlier, nodes), (1.0 + NODES_NEAR) * max(earlier, nodes)
+        may_differ = has_exchanges and earlier != nodes and low <= reached <= high
+        if not may_differ and np.array_equal(points, initial.points):
+            return True
+    return False
+
+
+def meshed_in_all(
+    ndim: int, nodes: int, begun: Callable[[int], Mesh], run: Callable[[Mesh, int], MeshingResult], has_exchanges: bool
+) -> MeshingResult:
     """Repeat runs with other numbers of corners until corners and mid-edge nodes together are `nodes`.
 
     Returns the result of the nearest run, or of one that was cut short.
     """
-    corners, ratio = 0, QUADRATIC_NODES[ndim]
-    nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more whole meshes are kept
+    ratio, runs = QUADRATIC_NODES[ndim], EarlierRuns()
+    nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more results are kept
     for _ in range(NODE_RUNS):
-        before, corners = corners, max(round(nodes / ratio), 2 ** (ndim + 1))
-        if corners == before:
+        initial = begun(corners := corners_of(nodes, ndim, ratio))
+        if _is_repeated(runs, initial, corners, has_exchanges):
             break
-        result = run(corners)._replace(nodes=nodes)
+        result = run(initial, corners)._replace(nodes=nodes)
+        runs.append((initial.points, corners, len(result.mesh.points)))
         if nearest and result.ended in CUT_SHORT:
             return nearest[0][1]._replace(ended=result.ended)
         count = node_count(result.mesh.points, result.mesh.cells, 2)
@@ -395,19 +415,19 @@ def meshed_to_error(
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # unexplained variance by number of nodes
-    best: list[MeshingResult] = []  # the one so far: no more whole meshes are kept
-    requests: set[int] = set()
+    best: list[MeshingResult] = []  # the one so far: no more results are kept
+    runs = EarlierRuns()
     for _ in range(ERROR_RUNS):
         nodes = max(nodes, fewest)
         initial = nearest_octree(content, nodes, sizes)
         # Limits on sizes may require more nodes than the error, or allow fewer; a mask's octree is only roughly near.
         if content.region is None and not is_near(len(initial.points), nodes):
             nodes = len(initial.points)
-        if nodes in requests:
+        if _is_repeated(runs, initial, nodes):
             break
-        requests.add(nodes)
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
         count, fraction = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
+        runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:
             is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(target_error, fraction)
             return best[0]._replace(ended=result.ended) if is_worse else result

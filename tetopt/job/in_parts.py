@@ -245,7 +245,7 @@ def _check_room(need: Need, room: float) -> None:
 def _request(task: Task) -> PartsRequest:
     """Return the request for a mesh in parts, with a checksum of everything that the mesh depends on."""
     plan, sizes = task.plan, task.sizes
-    engine, nodes = plan.engine_options, task.size.n_nodes
+    engine, nodes = plan.engine_options, plan.job.nodes or 0
     values: dict[str, Any] = {
         "nodes": nodes, "n_parts": plan.division.checked_number(nodes), "k_D": engine["k_D"],
         "iterations": engine["iterations"], "shape_power": engine["shape_power"],

@@ -180,7 +180,11 @@ def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
 
 def _of_field(record: Any, name: str, value: Any) -> Any:
     """Convert a value to the type of a record's field, and check its minimum."""
-    kind = kinds_of(record)[name]
+    return of_option(name, kinds_of(record)[name], value)
+
+
+def of_option(name: str, kind: Any, value: Any) -> Any:
+    """Convert a value to the type of an option, and check its minimum; raise InputError for an invalid one."""
     value, least = _of_kind(name, get_args(kind)[0], value), option_of(kind).least
     if value is not None and least is not None and value < least:
         raise InputError(f"`{name}`: expected {least} or more, got {value}")

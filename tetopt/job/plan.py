@@ -32,7 +32,7 @@ from tetopt.model.tissues import groups_of
 from tetopt.parts.division import Division
 from tetopt.parts.work import VolumeFile
 from tetopt.start.label_sizes import SizesByLabel
-from tetopt.start.lattice import KINDS
+from tetopt.start.lattice import KINDS, MAX_NODES
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.files import checked_output, results_folder
@@ -237,8 +237,9 @@ def _check_numbers(job: JobOptions) -> None:
         parse_crop(job.crop)
     if job.slice_ is not None:
         parse_slice(job.slice_)
-    if job.nodes is not None and job.nodes < FEWEST_NODES:
-        raise InputError(f"`nodes`: expected a whole number, {FEWEST_NODES} or more, got {job.nodes}")
+    most = round(MAX_NODES * (QUADRATIC_NODES[3] if job.order == 2 else 1))
+    if job.nodes is not None and not FEWEST_NODES <= job.nodes <= most:
+        raise InputError(f"`nodes`: expected a whole number from {FEWEST_NODES} to {most}, got {job.nodes}")
     if job.spacing is not None and not 0.0 < job.spacing < np.inf:
         raise InputError(f"`spacing`: expected a length above 0 mm, got {job.spacing}")
     if job.target_error is not None:

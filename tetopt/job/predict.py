@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.engine.cost import RunSize, predicted
-from tetopt.engine.meshing import QUADRATIC_NODES
+from tetopt.engine.meshing import QUADRATIC_NODES, corners_of
 from tetopt.image import Image
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
 from tetopt.io.zarr_images import is_zarr
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
-from tetopt.start.octree import least_nodes
+from tetopt.start.octree import is_near, least_nodes, nodes_of_sizes
 from tetopt.start.sizes import Sizes
 
 SEARCH_RUNS = 4  # for a target error, mostly, each with about the default number of nodes
@@ -43,15 +43,23 @@ def size_of_run(
     n_started : int, optional
         Number of corner nodes of a mesh to start from.
     sizes : Sizes, optional
-        Sizes of cells, which may need more nodes than a target error.
+        Sizes of cells, which may need more nodes than requested.
+
+    Raises
+    ------
+    InputError
+        No initial mesh is within the sizes; its own builder raises the same.
     """
-    nodes, spacing = plan.job.nodes, plan.job.spacing
-    if nodes is None and spacing is not None:
+    size, spacing = _size(plan, whole.shape, plan.job.nodes), plan.job.spacing
+    if spacing is not None:
         per_block = 1 if plan.job.lattice == "five-tet" else 2
-        nodes = max(round(per_block * content.volume / spacing**content.image.ndim), 1)
-    size = _size(plan, whole.shape, nodes)
-    if plan.mode == "graded" and plan.job.target_error is not None:
-        size = size._replace(n_nodes=max(size.n_nodes, round(least_nodes(content, size.n_nodes, sizes))))
+        size = size._replace(n_nodes=max(round(per_block * content.volume / spacing**content.image.ndim), 1))
+    if plan.mode == "graded":
+        if plan.job.target_error is not None and sizes is not None:
+            size = size._replace(n_nodes=max(size.n_nodes, nodes_of_sizes(content, sizes)[0]))
+        if (least := round(least_nodes(content, size.n_nodes, sizes))) > size.n_nodes:
+            is_bound = plan.job.target_error is None and not is_near(least, size.n_nodes)
+            size = size._replace(n_nodes=least, runs=1 if is_bound else size.runs)  # other runs would be the same
     return size._replace(
         n_voxels=prod(content.image.shape),
         n_nodes=size.n_nodes if n_started is None else n_started,
@@ -83,7 +91,7 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
     if like is None:
         return size
     n_voxels = round(size.n_read * like.n_voxels / like.n_read)
-    n_nodes = like.n_nodes if job.nodes is None else size.n_nodes
+    n_nodes = like.n_nodes if job.nodes is None else max(like.n_nodes, size.n_nodes)
     return size._replace(
         n_voxels=n_voxels, n_nodes=n_nodes, n_channels=like.n_channels, elongation=like.elongation,
         has_memberships=like.has_memberships, is_fractional=like.is_fractional,
@@ -118,15 +126,15 @@ def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
     job, order, ndim = plan.job, plan.order, len(shape)
     files = [*job.images, *(path for path in (job.mask, job.labels, *tissue_files(job.tissues)) if path is not None)]
     runs = SEARCH_RUNS if plan.job.target_error is not None else 1
-    corners = float(DEFAULT_NODES[ndim] if nodes is None else nodes)
+    corners = DEFAULT_NODES[ndim] if nodes is None else nodes
     if order == 2 and plan.mode != "start":
-        corners /= QUADRATIC_NODES[ndim] if nodes is not None else 1.0
+        corners = corners if nodes is None else corners_of(nodes, ndim, QUADRATIC_NODES[ndim])
         runs = runs if plan.job.spacing is not None else max(runs, QUADRATIC_RUNS)
     n_read = sum(prod(shape if is_zarr(path) else file_shape(file_and_volume(path)[0]) or shape) for path in files)
     has_region = job.mask is not None or job.background is not None
     is_labelled = job.labels is not None or job.tissues is not None
     return RunSize(
-        n_read=n_read, n_voxels=prod(shape), n_nodes=round(corners), iterations=plan.job.iterations or 0,
+        n_read=n_read, n_voxels=prod(shape), n_nodes=corners, iterations=plan.job.iterations or 0,
         n_channels=len(job.images) + is_labelled + has_region, ndim=ndim, mode=plan.mode,
         order=order, runs=runs, has_region=has_region, has_memberships=is_labelled,
         is_drawn=job.figures is not None,

@@ -28,7 +28,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
-from tetopt.start.lattice import near_cubes
+from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
@@ -128,31 +128,44 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     )
 
 
-def check_enough(content: Content, nodes: int, sizes: Sizes | None) -> None:
-    """Raise InputError for fewer nodes than the sizes need, as `octree_mesh` does."""
-    _check_enough(content, nodes, sizes, _block_limits(content, nodes, sizes))
+def check_octree(content: Content, nodes: int, sizes: Sizes | None) -> None:
+    """Raise InputError as `octree_mesh`; build it only if its number of nodes matters: without targets and masks."""
+    limits = _block_limits(content, nodes, sizes)
+    _check_enough(content, nodes, sizes, limits)
+    if limits.target is None and content.inside is None:
+        octree_mesh(content, nodes, sizes)
 
 
 def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
-    """Lower bound of the nodes of an octree of about so many `nodes` that the sizes need."""
-    return _least_and_enough(content, _block_limits(content, nodes, sizes))[0]
+    """Number of nodes of the coarsest octree that `nearest_octree` can make; an estimate for targets and in masks.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    limits = _block_limits(content, nodes, sizes)
+    if content.inside is not None:
+        limits = limits._replace(target=None)  # `_lighter` enlarges it
+    return max(_target_nodes(content, limits), _coarsest_nodes(content, nodes, limits))
 
 
 def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _BlockLimits) -> None:
-    least, enough = _least_and_enough(content, limits)
+    by_target = _target_nodes(content, limits)
+    least = max(_fewest_nodes(content, limits), by_target)
     if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
-        if limits.target is None and enough <= prod(content.image.shape):  # count, as the bound is low
-            enough = len(_octree_within(content, nodes, limits).points)
+        enough = max(_coarsest_nodes(content, nodes, limits), SIZED_OVER_EQUILATERAL * by_target)
         raise InputError(
             f"octree: {nodes} nodes are too few for {_given(content, sizes)}: they need at least {least:.4g}; "
             f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
 
 
-def _least_and_enough(content: Content, limits: _BlockLimits) -> tuple[float, float]:
-    """Lower bound of the nodes that the limits need, and a number that suffices for targets."""
-    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
-    return max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
+def _coarsest_nodes(content: Content, nodes: int, limits: _BlockLimits) -> float:
+    """Number of nodes of the coarsest octree within the limits, disregarding targets; in a mask an estimate."""
+    fitting = _fitting_roots(content, nodes, limits)
+    blocks = min(([count << depth for count in roots] for roots, depth in fitting), key=prod)
+    return (prod(blocks) + prod(each + 1 for each in blocks)) * (content.volume / content.image.volume)
 
 
 def _given(content: Content, sizes: Sizes | None) -> str:
@@ -308,7 +321,6 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
 def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree of the whole box with the nearest number of nodes."""
     image = content.image
-    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
     joined = leaf_nodes(divided, roots)
     points = image.to_world(joined.places() / np.array(roots) * image.shape - 0.5)
@@ -464,25 +476,37 @@ def _best_division(
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     image, channels = content.image, channels_of(content)
-    for roots in _root_counts(content, nodes, limits):
+    for roots, _ in _fitting_roots(content, nodes, limits):
         if (np.array(image.shape) / roots).max() < LEAF_VOXELS and best is not None:
             break
-        edge = image.spacing * image.shape / np.array(roots)
-        if _is_too_large(edge, _depths(edge, roots, image.spacing, limits)[0], limits):
-            continue
         blocks = _blocks_by_depth(content, channels, roots, limits)
         count, divided = _division(blocks, roots, nodes, limits.n_rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
         if abs(count - nodes) <= TRIAL_MISS * nodes:
             break
-    if best is None:
+    assert best is not None
+    return best[1:]
+
+
+def _fitting_roots(content: Content, nodes: int, limits: _BlockLimits) -> list[tuple[tuple[int, ...], int]]:
+    """Numbers of roots to try that can be divided within the limits, each with the least depth of all blocks.
+
+    Raise InputError without any, or for cells below voxels.
+    """
+    image, fitting = content.image, list[tuple[tuple[int, ...], int]]()
+    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
+    for roots in _root_counts(content, nodes, limits):
+        edge = image.spacing * image.shape / np.array(roots)
+        depths = range(_depths(edge, roots, image.spacing, limits)[0] + 1)
+        fitting += [(roots, depth) for depth in depths if not _is_too_large(edge, depth, limits)][:1]
+    if not fitting:
         least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits, image.ndim)
         raise InputError(
             f"sizes: the requested edges of {least:.3g} mm need blocks smaller than a voxel "
             f"({image.spacing.max():.3g} mm); allow longer ones"
         )
-    return best[1:]
+    return fitting
 
 
 def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
@@ -496,7 +520,7 @@ def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator
     kind = "bcc" if image.ndim == 3 else "criss-cross"
     coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * fraction))) for fraction in ROOT_FRACTIONS]
     if content.inside is not None:
-        within = near_cubes(kind, lengths, int(nodes / content.inside.mean()))
+        within = near_cubes(kind, lengths, min(int(nodes / content.inside.mean()), MAX_NODES))
         finest = np.maximum(np.array(image.shape) / LEAF_VOXELS, coarse[-1])
         coarse.append(tuple(int(c) for c in np.minimum(within, finest)))
     edges = [lengths / roots for roots in coarse]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.image import Image
-from tetopt.start.lattice import near_cubes
+from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.system.kernel_cache import njit
 
 # Default ratio of a graded mesh's longest edge to that of a uniform mesh with as many nodes
@@ -185,7 +185,7 @@ class Sizes(NamedTuple):
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         if volume is not None:  # nodes for a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
-        uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
+        uniform = float((lengths / near_cubes(kind, lengths, min(max(nodes, fewest), MAX_NODES))).max())
         coarsest = COARSEST_RATIO if self.coarsest is None else self.coarsest
         return LONGEST_IN_BLOCK[image.ndim] * max(coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim])
 

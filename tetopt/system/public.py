@@ -24,7 +24,7 @@ ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # annotations of arra
 TABLE_WORDS = ("Points", "Cells")  # those with two axes, which are not converted
 # Remedies for messages: how to get an object of each class.
 REMEDIES = {
-    "Image": "use tetopt.load_image(path) or tetopt.Image(array, affine)",
+    "Image": "use tetopt.load_image(path), tetopt.Image(array, affine), or the image of a Content",
     "Mesh": "use tetopt.load_mesh(path).mesh or tetopt.mesh_image(...).mesh",
     "Model": "use tetopt.build_model(mesh, ...)",
     "Solution": "use tetopt.solve(model)",
@@ -134,6 +134,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, bool | int | float | str | np.number | None):
         text = ascii(value) if isinstance(value, str) else str(value)
         return text if len(text) <= 80 else f"{text[:77]}..."
-    if isinstance(value, list | tuple):
+    if type(value) in (list, tuple):  # no record
         return f"{type(value).__name__} of {', '.join(sorted({type(each).__name__ for each in value})) or 'nothing'}"
     return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
