@@ -287,7 +287,7 @@ def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folde
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.meshing, "watched", None)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert "a.vtu: needs at least 8640 bytes, 5000 are free; free some space first" in capsys.readouterr().err
+    assert "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first" in capsys.readouterr().err
 
 
 def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):

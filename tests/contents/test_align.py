@@ -201,7 +201,7 @@ def test_masks_that_are_none():
     assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
     assert said(labels % 2 + 1) == what + "2 values from 1 to 2 (1, 2)" + todo
     assert said(labels * 0 - 1) == what + "1 values from -1 to -1 (-1)" + todo
-    empty = "m.nii: the mask is empty, expected voxels of 0.5 or more, got "
+    empty = "m.nii: the mask is empty: expected voxels of 0.5 or more, got "
     assert said(labels * 0) == empty + "0 in every voxel"
     assert said(labels / 64) == empty + "fractions up to 0.359375"
     away = image.affine @ _translation(10, 0, 0)

@@ -613,7 +613,7 @@ def test_messages_of_constrained():
     constrained(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
     for chosen, prescribed, words in (
-        (is_held, values, "prescribed: displacements must be finite, node 1 has [inf, 0.0]"),
+        (is_held, values, "prescribed: displacements must be finite, but node 1 has [inf, 0.0]"),
         (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), one row per node, got (4,)"),
         (is_held, values[:3], "prescribed: expected shape (4, 2), one row per node, got (3, 2)"),
     ):

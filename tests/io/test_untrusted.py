@@ -176,7 +176,7 @@ VTK_BOMBS = {
     "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed on"),
     "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed on"),
     "entity.vtu": (b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VTKFile/>', "document type or entities"),
-    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, its 146 bytes can hold at most 146"),
+    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, but its 146 bytes can hold at most 146"),
     "cells.vtk": (legacy(cells=2**60), "CELLS is"),
     "minus.vtk": (legacy(points=-1), "POINTS is -1"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),

@@ -767,7 +767,7 @@ def test_tetopt_can_fail(tmp_path):
     report = fake_report()
     report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out", reason="limit"), [])
     page = page_of(tmp_path, report)
-    assert "<strong>no mesh of tetopt&#39;s to compare: tetopt failed (timed out)</strong>" in page
+    assert "<strong>no tetopt mesh to compare: tetopt failed (timed out)</strong>" in page
     assert claims(page) == []
 
 

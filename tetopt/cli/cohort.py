@@ -126,7 +126,7 @@ class _CohortDisplay:
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
         out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
-            more = f"the page also shows {counted(n_more, 'subject')} more in {place}, from other tables"
+            more = f"the page also shows {counted(n_more, 'subject')} from other tables in {place}"
             log.print(escape(more))
         for name in (PAGE_NAME, TABLE_NAME):
             out.print(escape(str(place / name)))

@@ -28,7 +28,7 @@ def fem_command(
         list[Path],
         Option(
             "[IMAGE] MESH",
-            "VTU, VTK or MSH file. IMAGE is optional if this has moduli and loads, and provides intensities.",
+            "VTU, VTK or MSH file. IMAGE provides intensities; it is optional if this has moduli and loads.",
             is_argument=True,
         ),
     ],

@@ -46,9 +46,9 @@ def print_parts(task: Task) -> None:
     need = Need(number, n_bytes, job.threads, is_within=True)
     own = OCTREE_NODE_BYTES * nodes
     out.print(
-        f"about {counted(number, 'part')} per round, each up to {memory_words(n_bytes)} of memory, a worker "
-        f"{memory_words(need.limit_for(n_bytes))} in total; about {memory_words(own)} for this command, which builds "
-        "the octree in one piece"
+        f"about {counted(number, 'part')} per round, each up to {memory_words(n_bytes)} of memory "
+        f"({memory_words(need.limit_for(n_bytes))} with its worker); about {memory_words(own)} for this command, "
+        "which builds the octree in one piece"
     )
     free = available_bytes()
     if own > free:

@@ -77,7 +77,7 @@ def check_counts(path: Path) -> None:
             name, number = match[1].decode("latin-1"), float(match[2])
             if not 0 <= number <= most:
                 count = match[2][:40].decode()
-                raise InputError(f"damaged: {name[:40]} is {count}, its {size} bytes can hold at most {most}")
+                raise InputError(f"damaged: {name[:40]} is {count}, but its {size} bytes can hold at most {most}")
 
 
 # In the child

@@ -99,7 +99,7 @@ def _shape_criteria() -> list[Criterion]:
     return [
         row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail (1/3: regular tetrahedron)"),
         row("p1 rho", ("p1_rho",), 1, "the worst 1 % of the cells"),
-        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells are near it: it is one cell's angle"),
+        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells come close: it is one cell's angle"),
         Criterion("Shape", "Shape", "bad cells (3 rho < 0.3), %", bad_percent, -1, is_headline=True,
             blind="how bad they are, and their kind: slivers harm a stiffness matrix more than needles (below)"),
         row("min rho", ("min_rho",), 1),

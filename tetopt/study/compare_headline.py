@@ -188,7 +188,7 @@ def _title(report: Report, ours: int | None, peers: list[int]) -> str:
     void = [failure_words(each) for each in tried if each.median is None]
     if ours is None:
         failed = [failure_words(each) for each in report.pipelines if each.kind == "tetopt"]
-        return f"no mesh of tetopt's to compare: {'; '.join(failed) or 'none of its pipelines was requested'}"
+        return f"no tetopt mesh to compare: {'; '.join(failed) or 'none of its pipelines was requested'}"
     title = report.pipelines[ours].title
     if not peers:
         return f"{title} against no peer: {'; '.join(void) or 'none was requested'}"
@@ -212,8 +212,8 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
         remarks.append(
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges, or below "
             f"{EQUAL_FRACTION:.1%}, does not count; a single run has no range. An error has no verdict if the "
-            "meshes differ by less than the reference does from its own half resolution; nor have time and memory "
-            "of single runs."
+            "meshes differ by less than the reference differs from its solution at half the resolution; nor do time "
+            "and memory of single runs."
         )
     for order, word in ORDER_WORDS.items():
         for each in of_order(report, order):

@@ -51,15 +51,16 @@ class SimulationOptions:
 
     panel: ClassVar[str] = "Simulation"
     young: Annotated[
-        str | None, Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
+        str | None,
+        Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over the image's range."),
     ] = None
     average: Annotated[str, AVERAGE_OPTION] = DEFAULT_SETTINGS.average
     reference_seconds: Annotated[
-        float | None, Option("S", "Time for the reference on the voxel grid, made as fine as fits. Default: 120.")
+        float | None, Option("S", "Time for the voxel reference, made as fine as this allows. Default: 120.")
     ] = None
-    reference_dofs: Annotated[int | None, Option("D", "Exact size of that grid, instead of a time.", least=1000)] = (
-        DEFAULT_SETTINGS.reference_dofs
-    )
+    reference_dofs: Annotated[
+        int | None, Option("D", "Exact number of unknowns of the reference, instead of a time.", least=1000)
+    ] = DEFAULT_SETTINGS.reference_dofs
 
 
 @dataclass(frozen=True, kw_only=True)
