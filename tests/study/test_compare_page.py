@@ -271,10 +271,10 @@ DERIVED = {
     (JUDGED, "largest label volume error"): lambda rows: max(
         abs(r.mesh_volume_mm3 / r.volume_mm3 - 1) for r in rows[1:3]
     ),
-    (JUDGED, "label area over smoothed voxels', mean by voxels"): lambda rows: np.average(
+    (JUDGED, "label area over smoothed voxels', weighted mean"): lambda rows: np.average(
         [r.area_ratio for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
     ),
-    (JUDGED, "label edges folded over 60°, mean by voxels"): lambda rows: np.average(
+    (JUDGED, "label edges folded over 60°, weighted mean"): lambda rows: np.average(
         [r.folded for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
     ),
     (JUDGED, "label edges in more than two facets"): lambda rows: sum(r.nonmanifold_edges for r in rows[1:3]),
@@ -377,7 +377,7 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
     """Its surface has no distance: the mean over the other labels would make losing it pay."""
     report = fake_report()
     lose(report.pipelines[0].runs[0], 2)
-    for title in ("mean label surface distance, mm", "label edges folded over 60°, mean by voxels"):
+    for title in ("mean label surface distance, mm", "label edges folded over 60°, weighted mean"):
         cell = measures(page_of(tmp_path, report))[JUDGED, title][0]
         assert cell == [{"tetopt", "lost"}, ["–", "no value"]]
 
@@ -587,7 +587,7 @@ def test_the_headline_is_a_handful_of_numbers(tmp_path):
     assert all(re.match("does not capture .{10}", texts[0][2]) for texts in first.values())
     assert not re.search(r"(best|loses) in \d+", page)
     titles = {criterion.title for criterion in criteria(report) if criterion.better == 0}
-    assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', mean by voxels", "λ max"}
+    assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', weighted mean", "λ max"}
     assert all(row.blind for row in criteria(report) if not row.is_detail and row.better)
 
 

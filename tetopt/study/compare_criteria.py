@@ -143,8 +143,8 @@ def _label_criteria(report: Report) -> list[Criterion]:
         ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is: lost and gained "
             "parts cancel each other"),
         ("labels lost (of any size)", _n_lost, -1, "labels that keep a single cell"),
-        ("label area over smoothed voxels', mean by voxels", by_voxels(attrgetter("area_ratio")), 0, ""),
-        ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1, ""),
+        ("label area over smoothed voxels', weighted mean", by_voxels(attrgetter("area_ratio")), 0, ""),
+        ("label edges folded over 60°, weighted mean", by_voxels(attrgetter("folded")), -1, ""),
         ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1, ""),
         ("of these, where two labels meet", over(sum, attrgetter("nonmanifold_edges_two_labels")), -1, ""),
         ("labels with more or fewer components", over(sum, lambda row: row.mesh_components != row.components), -1, ""),

@@ -158,7 +158,7 @@ def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
         if claim.verdict == "no verdict" and claim.other_kind == "peer" and claim.is_lost
     ]
     if lost:
-        yield f"A peer's number is better, without a verdict: {'; '.join(lost)}."
+        yield f"A peer is better, but without a verdict: {'; '.join(lost)}."
 
 
 def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verdict:

@@ -26,8 +26,12 @@ class ComparedOptions:
     nodes: Annotated[int, Option("N", "Target number of nodes of every mesh.", least=20)] = DEFAULT_SETTINGS.nodes
     labels: Annotated[Path | None, Option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
     label_names: LabelNamesOption = None
-    repeats: Annotated[int, Option("R", "Runs of a mesher whose result varies.", least=1)] = DEFAULT_SETTINGS.repeats
-    pipelines: Annotated[str, Option("A,B,...", f"In order, from {', '.join(PIPELINES)}.")] = ",".join(PIPELINES)
+    repeats: Annotated[int, Option("R", "Number of runs for meshers whose result varies.", least=1)] = (
+        DEFAULT_SETTINGS.repeats
+    )
+    pipelines: Annotated[str, Option("A,B,...", f"Pipelines, in order: some of {', '.join(PIPELINES)}.")] = ",".join(
+        PIPELINES
+    )
     programs: Annotated[
         list[str] | None,
         Option(
