@@ -183,7 +183,7 @@ class SizeOptions:
         str | None,
         Option(
             "LABEL=SIZE,...",
-            'Target edge by label or name, mm, or a fraction of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
+            'Target edge by label or name, mm or a fraction of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
             "or a .toml or .csv file.",
         ),
     ] = None
