@@ -652,8 +652,8 @@ def test_no_verdict_below_the_references_own_change(tmp_path, change, verdict):
     report = report._replace(reference=report.reference._replace(by_nu={"0.3": known}))
     claim = claim_of(report, DISPLACEMENT)
     assert (claim.verdict, claim.own_change) == (verdict, change)
-    is_void, why = verdict == "no verdict", "less than the reference's own change, 0.03"
-    known = why if is_void else f"reference's own change {change or 'not known'}"
+    is_void, why = verdict == "no verdict", "less than the reference's own error, 0.03"
+    known = why if is_void else f"reference's own error {change or 'not known'}"
     assert claim.beside == [known, "nodes 5000 and 5010"]
     first = headline(report)
     assert (DISPLACEMENT in {row.measure for row in first.behind_peers()}) != is_void
@@ -667,7 +667,7 @@ def test_no_verdict_below_the_references_own_change(tmp_path, change, verdict):
         ["0.104", f"1.3× the best{f', {why}' * is_void}"],
     ]
     strain = next(row for row in first.behind_peers() if row.measure.startswith("interface-strain error, ν = 0.3, lin"))
-    assert strain.beside[0] == "reference's own change not known"
+    assert strain.beside[0] == "reference's own error not known"
     assert not next(row for row in first.claims if row.group == "Image").beside[0].startswith("reference")
 
 

@@ -157,7 +157,9 @@ def cells_of_rows(
     for kind, chosen in rows_of_kind.items():
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
-            raise InputError(f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, some have another number")
+            raise InputError(
+                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have another number"
+            )
         cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
     return cells
 

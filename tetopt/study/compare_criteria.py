@@ -264,7 +264,7 @@ def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str
     if criterion.own_change is None or first is None or second is None:
         return ""
     is_below = abs(first - second) < criterion.own_change
-    return f"less than the reference's own change, {short_text(criterion.own_change)}" if is_below else ""
+    return f"less than the reference's own error, {short_text(criterion.own_change)}" if is_below else ""
 
 
 def winners(better: int, values: Sequence[float | None]) -> list[int]:

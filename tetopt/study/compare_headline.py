@@ -139,7 +139,7 @@ def _beside(row: Criterion, pipelines: list[PipelineResult], places: tuple[int, 
     words = [why] if why else []
     if row.is_error and not why:  # which states it
         change = "not known" if row.own_change is None else short_text(row.own_change)
-        words.append(f"reference's own change {change}")
+        words.append(f"reference's own error {change}")
     nodes = [number_text(each.n_nodes) for place in places if (each := _measured(pipelines[place])) is not None]
     if len(set(nodes)) > 1:
         words.append(f"nodes {' and '.join(nodes)}")
