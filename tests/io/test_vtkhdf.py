@@ -153,7 +153,7 @@ def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
     write_pieces(tmp_path / "a.vtkhdf", pieces)
     with h5py.File(tmp_path / "a.vtkhdf", "r+") as file:
         file["VTKHDF/Offsets"][len(pieces[0][1]) + 1] = 4
-    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: its cells, or its data, do not fit together"):
+    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: its cells or data are inconsistent"):
         load_mesh(tmp_path / "a.vtkhdf")
 
 

@@ -59,7 +59,7 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
     is_whole &= all(len(each) == len(grid.points) for each in grid.point_data.values())
     is_whole &= all(len(each) == n for each in grid.cell_data.values())
     if not is_whole or (np.diff(starts) < 0).any():
-        raise InputError("damaged: its cells, or its data, do not fit together")
+        raise InputError("damaged: its cells or data are inconsistent")
     return grid
 
 

@@ -253,7 +253,7 @@ def _joined(
     n_points, _, n_nodes, n_offsets = (np.array(counts[name], dtype=np.int64) for name in ARRAYS)
     ends = np.cumsum(n_offsets)
     if (offsets[ends - n_offsets] != 0).any() or (offsets[ends - 1] != n_nodes).any():
-        raise InputError("damaged: its cells, or its data, do not fit together")
+        raise InputError("damaged: its cells or data are inconsistent")
     sizes = np.delete(np.diff(offsets), ends[:-1] - 1)
     if len(n_points) > 1:
         if ((nodes < 0) | (nodes >= np.repeat(n_points, n_nodes))).any():
