@@ -75,7 +75,7 @@ def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, si
     assert numbers_in(folder / "a.json")["iterations_done"] < 5
     assert len(tetopt.load_mesh(folder / "a.vtu").mesh.cells) > 100
     lines = capsys.readouterr().err.splitlines()
-    assert any(line.startswith("interrupted: the mesh so far is kept") for line in lines)
+    assert any(line.startswith("interrupted: the current mesh is kept") for line in lines)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert lines[-1] == f"ended by {name}; written: {folder / 'a.vtu'}, {folder / 'a.json'}"
 

@@ -161,7 +161,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     exit_code(*words, "--max-gb", "0.001")
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["ended"] == "max_gb"
-    assert "memory limit reached: the mesh so far is kept" in capsys.readouterr().err
+    assert "memory limit reached: the current mesh is kept" in capsys.readouterr().err
     tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
 
 

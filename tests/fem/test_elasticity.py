@@ -421,7 +421,7 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
     monkeypatch.setattr(elasticity, "RESIDUAL_FRACTION", 1e-30)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(RuntimeError, match=r"^elasticity: not solved, the residual .* mN exceeds .* mN$"):
+        with pytest.raises(RuntimeError, match=r"^elasticity: not solved: the residual .* mN exceeds .* mN$"):
             squeezed(mesh, image, 2.0, 0.4, method=method)
 
 

@@ -36,7 +36,7 @@ def cohort_command(
     cohort: CohortOptions,
     options: RunOptions,
 ) -> int:
-    """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
+    """Mesh many subjects from a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
     try:
         plan = plan_cohort(subjects, cohort, options)
     except Problems as problems:

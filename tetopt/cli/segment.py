@@ -31,7 +31,7 @@ def segment_command(
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
-    """Segment an image by its mesh, fast and roughly: group cells by mean into K classes and label their voxels."""
+    """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and label their voxels."""
     from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)

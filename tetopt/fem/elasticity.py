@@ -575,7 +575,7 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_FRACTION * float(np.linalg.norm(system.load))
         if not residual <= allowed:
-            raise RuntimeError(f"elasticity: not solved, the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
+            raise RuntimeError(f"elasticity: not solved: the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
         dofs[system.free] = solution
     return dofs.reshape(-1, n) @ system.frame.T, n_steps
 

@@ -263,8 +263,10 @@ class EngineOptions:
         ),
     ] = None
     threads: Annotated[int | None, Option("N", "Number of threads; the result does not depend on it.")] = None
-    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the mesh so far.")] = None
-    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the mesh so far.")] = None
+    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the current mesh.")] = None
+    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the current mesh.")] = (
+        None
+    )
 
 
 WorkersOption = Annotated[

@@ -15,7 +15,7 @@ from tetopt.study.program import Program, parse_program
 from tetopt.system.budget import BYTES_PER_GB
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-ClassesOption = Annotated[int, Option("K", "Classes of the segmentation (multi-Otsu).", least=2)]
+ClassesOption = Annotated[int, Option("K", "Number of segmentation classes (multi-Otsu).", least=2)]
 
 
 @dataclass(frozen=True, kw_only=True)
