@@ -213,7 +213,7 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges, or below "
             f"{EQUAL_FRACTION:.1%}, does not count; a single run has no range. An error has no verdict if the "
             "meshes differ by less than the reference differs from its solution at half the resolution. Time and "
-            "memory of single runs have none either."
+            "memory of single runs have no verdict either."
         )
     for order, word in ORDER_WORDS.items():
         for each in of_order(report, order):
