@@ -226,7 +226,7 @@ def test_labels_that_are_none():
         "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
     )
     for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 32_768, "32768")):
-        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767, .* the first {value} at", said(bad))
+        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767; .* the first {value} at", said(bad))
     assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
     assert said(labels, _translation(0, 3, 0)) == (
         "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
