@@ -169,7 +169,7 @@ def legacy(points=4, cells=1, numbers=5, more=""):
 
 
 VTK_BOMBS = {
-    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, its .* at most"),
+    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, but its .* at most"),
     "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "NumberOfPoints is -4"),
     "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
     "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "NumberOfTuples is"),
