@@ -208,7 +208,7 @@ def test_labels_alone(inputs, tmp_path, capsys):
     assert exit_code(*command, "--json", tmp_path / "a.json") == 0
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     captured = capsys.readouterr()
-    assert "only these are used" in captured.err
+    assert "only the labels are used" in captured.err
     assert "E_D, fraction of the labels' variance" in captured.out
     assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
     first = re.search(r'"fields": \[\{"name": "(\w+)"', (tmp_path / "a.html").read_text())[1]

@@ -259,7 +259,10 @@ ITK_BOMBS = {
     "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
     "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
     "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
-    "huge.mha": (mha(sizes="32767 32767 32767"), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, but the file"),
+    "huge.mha": (
+        mha(sizes="32767 32767 32767"),
+        r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, but the file",
+    ),
     "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "declares 32767 x"),
     "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "declares 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "unknown voxel type MET_OTHER"),

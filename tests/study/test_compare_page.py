@@ -695,7 +695,7 @@ def test_no_verdict_on_time_and_memory_of_one_run(tmp_path, seconds, verdict):
     behind = {row.measure for row in first.behind_peers()}
     assert ({"wall time, s", "peak memory, MB"} <= behind) == (verdict == "worse")
     (remark,) = (
-        (line for line in first.remarks if line.startswith("A peer's number")) if verdict == "no verdict" else ("",)
+        (line for line in first.remarks if line.startswith("A peer is better")) if verdict == "no verdict" else ("",)
     )
     assert ("wall time, s (1.14×, one run each)" in remark) == (verdict == "no verdict")
     assert ("peak memory, MB (1.14×, one run each)" in remark) == (verdict == "no verdict")
