@@ -314,7 +314,7 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert_covers(mesh, load_image(inputs / "sphere.nii.gz"))
     assert numbers["mesh_sha256"] == mesh_hash(mesh)
-    assert "out of time: the mesh so far is kept" in capsys.readouterr().err
+    assert "out of time: the current mesh is kept" in capsys.readouterr().err
 
 
 def test_what_is_violated_is_told_in_the_commands_options(capsys):
@@ -360,7 +360,7 @@ def test_ctrl_c_leaves_a_valid_mesh(tmp_path, inputs):
     finally:
         process.kill()
     assert process.returncode == 130
-    assert "interrupted: the mesh so far is kept" in errors
+    assert "interrupted: the current mesh is kept" in errors
     assert "Traceback" not in errors
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert_covers(mesh, load_image(inputs / "sphere.nii.gz"))

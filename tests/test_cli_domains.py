@@ -208,7 +208,7 @@ def test_labels_alone(inputs, tmp_path, capsys):
     assert exit_code(*command, "--json", tmp_path / "a.json") == 0
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     captured = capsys.readouterr()
-    assert "only these are used" in captured.err
+    assert "only the labels are used" in captured.err
     assert "E_D, fraction of the labels' variance" in captured.out
     assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
     first = re.search(r'"fields": \[\{"name": "(\w+)"', (tmp_path / "a.html").read_text())[1]
@@ -320,7 +320,7 @@ def test_intensities_are_no_labels(inputs, tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
     command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
     exit_code(*command)
-    assert "elements are too large for them, or this is not a label image" in " ".join(capsys.readouterr().err.split())
+    assert "elements are too large, or this is not a label image" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):

@@ -75,7 +75,7 @@ def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, si
     assert numbers_in(folder / "a.json")["iterations_done"] < 5
     assert len(tetopt.load_mesh(folder / "a.vtu").mesh.cells) > 100
     lines = capsys.readouterr().err.splitlines()
-    assert any(line.startswith("interrupted: the mesh so far is kept") for line in lines)
+    assert any(line.startswith("interrupted: the current mesh is kept") for line in lines)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert lines[-1] == f"ended by {name}; written: {folder / 'a.vtu'}, {folder / 'a.json'}"
 
@@ -287,7 +287,7 @@ def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folde
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.meshing, "watched", None)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert "a.vtu: needs at least 8640 bytes, 5000 are free; free some space first" in capsys.readouterr().err
+    assert "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first" in capsys.readouterr().err
 
 
 def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):

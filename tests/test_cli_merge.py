@@ -72,7 +72,7 @@ def test_quality_merges_the_same_labels_and_takes_merged_ones(folder, capsys):
 
 def test_an_image_may_be_its_own_labels(folder, capsys):
     assert exit_code(*words(folder, "--merge", "synthseg", "--figures", folder / "figs", image="l.nii.gz")) == 0
-    assert "the image is its own labels" in capsys.readouterr().err
+    assert "the image is also the label image" in capsys.readouterr().err
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert loaded.cell_data["mean"].max() <= 5.0  # of tissues, not of the file's numbers
     assert numbers_in(folder / "m.json")["inputs"]["weights"] == [0.0]

@@ -100,7 +100,7 @@ def test_bytes_and_other_grids_are_told(folder, capsys):
 
 def test_the_image_may_be_one_of_them(folder, capsys):
     assert exit_code(*words(folder, "--tissues", both(folder), image="white.nii.gz")) == 0
-    assert "the image is one of the tissues: only these are used\n" in capsys.readouterr().err
+    assert "the image is also one of the tissues: only the tissues are used\n" in capsys.readouterr().err
     assert numbers_in(folder / "m.json")["inputs"]["weights"] == [0.0]
 
 

@@ -88,11 +88,11 @@ def test_a_limit_counts_what_there_is(monkeypatch):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
     monkeypatch.setattr(budget, "resident_bytes", lambda: 400)
     budget.check_memory(1000, "a", "b")
-    with pytest.raises(tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory, 0\.001 MB is free; b$"):
+    with pytest.raises(tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory, but only 0\.001 MB is free; b$"):
         budget.check_memory(1001, "a", "b")
     budget.check_memory(600, "a", "b", limit=1000)
     with pytest.raises(
-        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in total, 0\.001 MB is allowed; b$"
+        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in total, but only 0\.001 MB is allowed; b$"
     ):
         budget.check_memory(601, "a", "b", limit=1000)
     assert not budget.MemoryLimit(1000, 600).is_reached()
@@ -120,7 +120,7 @@ TASKS = {
 @pytest.mark.parametrize("words", TASKS)
 def test_what_needs_more_than_there_is_does_not_begin(monkeypatch, words):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
-    with pytest.raises(tetopt.InputError, match=words.replace("needs", "needs about .* 0.001 MB is free; ")):
+    with pytest.raises(tetopt.InputError, match=words.replace("needs", "needs about .* but only 0.001 MB is free; ")):
         TASKS[words]()
 
 
@@ -140,8 +140,9 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
     words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force")
     assert exit_code(*words, "--max-gb", "0.001") == 2
-    assert "GB of memory in total, 1 MB is allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
-        "\n", " "
+    assert (
+        "GB of memory in total, but only 1 MB is allowed; mesh a part of it (--crop)"
+        in capsys.readouterr().err.replace("\n", " ")
     )
     assert not (tmp_path / "a.vtu").exists()
     for value in ("0", "-1", "nan"):
@@ -160,7 +161,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     exit_code(*words, "--max-gb", "0.001")
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["ended"] == "max_gb"
-    assert "memory limit reached: the mesh so far is kept" in capsys.readouterr().err
+    assert "memory limit reached: the current mesh is kept" in capsys.readouterr().err
     tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
 
 

@@ -66,10 +66,10 @@ def test_unused_nodes_are_allowed():
         (TRIANGLE, [[-1, 1, 2]], r"expected indices in 0\.\.2, got -1\.\.2"),
         ([[0, 0], [1, np.nan], [0, 1]], [[0, 1, 2]], r"node 1 is \[1\.0, nan\]"),
         ([[0, 0], [1, 0], [np.inf, 1]], [[0, 1, 2]], r"node 2 is \[inf, 1\.0\]"),
-        (TRIANGLE, [[0, 1, 2], [0, 2, 1]], r"1 of 2 are flat or inverted, the first are \[1\]"),
+        (TRIANGLE, [[0, 1, 2], [0, 2, 1]], r"1 of 2 are flat or inverted, such as \[1\]"),
         (TRIANGLE, [[0, 1, 1]], "1 of 1 are flat or inverted"),
         ([[0, 0], [1, 1], [2, 2]], [[0, 1, 2]], "1 of 1 are flat or inverted"),
-        (REGULAR_TET[0], [[1, 0, 2, 3]] * 7, r"7 of 7 are flat or inverted, the first are \[0, 1, 2, 3, 4\]"),
+        (REGULAR_TET[0], [[1, 0, 2, 3]] * 7, r"7 of 7 are flat or inverted, such as \[0, 1, 2, 3, 4\]"),
     ],
 )
 def test_what_is_no_mesh_is_refused(points, cells, message):

@@ -376,7 +376,7 @@ def check_finite(n_bad: int, first: tuple[int, ...]) -> None:
     if n_bad > 0:
         raise InputError(
             f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them first, for "
-            "example by the background's value"
+            "example with the background's value"
         )
 
 

@@ -84,7 +84,7 @@ class Mesh:
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)
             raise InputError(
-                f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, the first are {bad[:5].tolist()}; "
+                f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, such as {bad[:5].tolist()}; "
                 "orient them or repair the mesh"
             )
         points.setflags(write=False)

@@ -430,7 +430,7 @@ def test_a_cluster_all_of_whose_jobs_end_as_they_begin_is_given_up(count, batch,
     path = written(tmp_path, "jobqueue: {slurm: {python: /bin/false}}")
     with running(Need(9, 1.0, None), folders, count=count, cluster=path) as crew:
         assert crew.words.startswith(f"up to {count} job")
-        with pytest.raises(InputError, match="jobs ended at their start; see their logs in"):
+        with pytest.raises(InputError, match="jobs ended right after starting; see their logs in"):
             until(lambda: crew.slots() > 0)
     assert 3 <= len((tmp_path / "submitted").read_text()) < 20
     assert list(folders.work.iterdir()) == []

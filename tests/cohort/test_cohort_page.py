@@ -56,12 +56,12 @@ def test_what_differs_is_said_with_how_many(tmp_path):
     text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
     hostile = html.escape(plain(plain(HOSTILE)))
     words = f"nodes: 300 (8), 250 (2); k_D: 10 values; gradation: none (9), {hostile} (1)."
-    assert f"Different, with numbers of subjects: {words}" in text
+    assert f"Differences, with numbers of subjects: {words}" in text
     assert {"options.nodes", "options.k_D", "request.options.gradation"} <= {
         column["name"] for column in data_of(text)["columns"]
     }
     assert "Common to all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(r"Meshing took [\d.]+ min of computing, without start-up and pictures[.]", text)
+    assert re.search(r"Meshing took [\d.]+ min of computing, excluding start-up and pictures[.]", text)
 
 
 def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):

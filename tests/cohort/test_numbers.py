@@ -89,7 +89,7 @@ def test_numbers_without_a_mesh_are_a_failure(tmp_path):
     save_run(tmp_path, "sub-1", run_of(RNG), suffix=".inp")
     assert collect(tmp_path)[0].files["mesh"].endswith("_mesh.inp")
     (subject_folder(tmp_path, "sub-1") / mesh_name("sub-1", ".inp")).unlink()
-    assert collect(tmp_path)[0].reason == "its mesh is missing, though there are numbers; run it again"
+    assert collect(tmp_path)[0].reason == "its numbers exist, but its mesh is missing; run it again"
 
 
 def test_numbers_have_names_with_dots():

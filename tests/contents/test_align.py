@@ -201,7 +201,7 @@ def test_masks_that_are_none():
     assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
     assert said(labels % 2 + 1) == what + "2 values from 1 to 2 (1, 2)" + todo
     assert said(labels * 0 - 1) == what + "1 values from -1 to -1 (-1)" + todo
-    empty = "m.nii: the mask is empty, expected voxels of 0.5 or more, got "
+    empty = "m.nii: the mask is empty: expected voxels of 0.5 or more, got "
     assert said(labels * 0) == empty + "0 in every voxel"
     assert said(labels / 64) == empty + "fractions up to 0.359375"
     away = image.affine @ _translation(10, 0, 0)
@@ -226,7 +226,7 @@ def test_labels_that_are_none():
         "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
     )
     for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 32_768, "32768")):
-        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767, .* the first {value} at", said(bad))
+        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767; .* the first {value} at", said(bad))
     assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
     assert said(labels, _translation(0, 3, 0)) == (
         "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "

@@ -136,5 +136,7 @@ def test_too_thin_for_its_cells():
     image = tetopt.Image(mask)
     mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
     moved = tetopt.Mesh(mesh.points + np.where(mesh.points == 14.5, 3.0, 0.0), mesh.cells)
-    with pytest.raises(tetopt.InputError, match="thinner than the cells, so none is left inside; increase the number"):
+    with pytest.raises(
+        tetopt.InputError, match="thinner than the cells, so no cell is left inside; increase the number"
+    ):
         clipped(moved, image, region_of(image))

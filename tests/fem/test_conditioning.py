@@ -200,6 +200,6 @@ def test_no_convergence_is_an_error():
     # As bad a preconditioner as can be: the matrix itself.
     ill = system(2, (30, 30), contrast=1e6).K_ff
     with pytest.raises(
-        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge, as a solve did not$"
+        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge, because a solve did not$"
     ):
         lambda_min(ill, ill)

@@ -421,7 +421,7 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
     monkeypatch.setattr(elasticity, "RESIDUAL_FRACTION", 1e-30)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(RuntimeError, match=r"^elasticity: not solved, the residual .* mN exceeds .* mN$"):
+        with pytest.raises(RuntimeError, match=r"^elasticity: not solved: the residual .* mN exceeds .* mN$"):
             squeezed(mesh, image, 2.0, 0.4, method=method)
 
 
@@ -613,7 +613,7 @@ def test_messages_of_constrained():
     constrained(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
     for chosen, prescribed, words in (
-        (is_held, values, "prescribed: displacements must be finite, node 1 has [inf, 0.0]"),
+        (is_held, values, "prescribed: displacements must be finite, but node 1 has [inf, 0.0]"),
         (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), one row per node, got (4,)"),
         (is_held, values[:3], "prescribed: expected shape (4, 2), one row per node, got (3, 2)"),
     ):

@@ -269,5 +269,5 @@ def test_same_bits_on_any_number_of_threads():
 def test_says_when_it_is_not_solved(monkeypatch):
     grid, u = big((9, 9, 9), STRAIGHT, 0.3, 10.0)
     monkeypatch.setattr("tetopt.fem.voxels.ITERATION_LIMIT", 2)
-    with pytest.raises(RuntimeError, match=r"reference: not solved, the residual .* mN exceeds"):
+    with pytest.raises(RuntimeError, match=r"reference: not solved: the residual .* mN exceeds"):
         solve_voxels(grid, u)

@@ -519,8 +519,8 @@ def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
         ("0 1 2 2", "1", "1 of 1 are flat"),
         ("0 1 2 3", "nan", "expected finite coordinates, but node 3"),
         ("0 1 2 3", "inf", "expected finite coordinates, but node 3"),
-        ("0 1 2 7", "1", "nodes 0..7, it has 0..4"),
-        ("0 1 2 -1", "1", "nodes -1..2, it has 0..4"),
+        ("0 1 2 7", "1", "nodes 0..7, but it has 0..4"),
+        ("0 1 2 -1", "1", "nodes -1..2, but it has 0..4"),
         ("0 1 2", "1", "damaged"),
     ],
 )
@@ -533,4 +533,4 @@ def test_a_middle_node_that_there_is_not(tmp_path, assert_refused):
     text = VTU.format(nodes="0 1 2 3 4 4 4 4 4 9", z="1")
     text = text.replace('"ascii">10<', '"ascii">24<').replace('"ascii">4<', '"ascii">10<')
     (tmp_path / "a.vtu").write_text(text)
-    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it has 0..4; damaged")
+    assert_refused(tmp_path / "a.vtu", "nodes 0..9, but it has 0..4; damaged")

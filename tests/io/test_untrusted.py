@@ -169,14 +169,14 @@ def legacy(points=4, cells=1, numbers=5, more=""):
 
 
 VTK_BOMBS = {
-    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, its .* at most"),
+    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, but its .* at most"),
     "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "NumberOfPoints is -4"),
     "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
     "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "NumberOfTuples is"),
     "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed on"),
     "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed on"),
     "entity.vtu": (b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VTKFile/>', "document type or entities"),
-    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, its 146 bytes can hold at most 146"),
+    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, but its 146 bytes can hold at most 146"),
     "cells.vtk": (legacy(cells=2**60), "CELLS is"),
     "minus.vtk": (legacy(points=-1), "POINTS is -1"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),
@@ -200,7 +200,7 @@ def test_the_bombs_are_else_good(tmp_path, name, raw):
 
 def test_cells_of_another_number_of_nodes(tmp_path):
     (tmp_path / "a.vtk").write_bytes(legacy(numbers=4).replace(b"4 0 1 2 3", b"3 0 1 2"))
-    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, some have another number")
+    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, but some have another number")
     (tmp_path / "a.vtk").write_bytes(legacy().replace(b"\n10\n", b"\n99\n"))
     refused(load_mesh, tmp_path / "a.vtk", "no cells of type 99|damaged")
 
@@ -259,7 +259,10 @@ ITK_BOMBS = {
     "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
     "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
     "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
-    "huge.mha": (mha(sizes="32767 32767 32767"), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
+    "huge.mha": (
+        mha(sizes="32767 32767 32767"),
+        r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, but the file",
+    ),
     "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "declares 32767 x"),
     "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "declares 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "unknown voxel type MET_OTHER"),

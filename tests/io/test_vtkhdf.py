@@ -153,7 +153,7 @@ def test_pieces_that_do_not_fit_together_are_refused(tmp_path):
     write_pieces(tmp_path / "a.vtkhdf", pieces)
     with h5py.File(tmp_path / "a.vtkhdf", "r+") as file:
         file["VTKHDF/Offsets"][len(pieces[0][1]) + 1] = 4
-    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: its cells, or its data, do not fit together"):
+    with pytest.raises(InputError, match=r"a\.vtkhdf: damaged: its cells or data are inconsistent"):
         load_mesh(tmp_path / "a.vtkhdf")
 
 
@@ -217,7 +217,7 @@ BAD = {
     "whole group": (linked(h5py.ExternalLink("b.h5", "/"), "PointData"), 'expected data for "PointData", got a link'),
     "virtual": (virtual, '"mean" is stored in another file'),
     "outside": (outside, '"mean" is stored in another file'),
-    "bomb": (empty_bomb, 'damaged: "mean" should have 8796093022208 bytes, the file stores 0'),
+    "bomb": (empty_bomb, 'damaged: "mean" should have 8796093022208 bytes, but the file stores 0'),
     "lzf": (changed("CellData/mean", np.zeros(192), compression="lzf"), '"mean" has an unsupported compression'),
     "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" has neither numbers nor texts'),
     "short": (changed("CellData/mean", np.zeros(191)), 'damaged: "mean" has 191 rows, its pieces 192'),

@@ -28,8 +28,8 @@ def test_equal_pairs_are_one_material():
         ([1.0, 0.0, 2.0], 0.3, "above 0 kPa, got 1 invalid values, the first 0 in cell 1"),
         ([1.0, np.nan, 2.0], 0.3, "above 0 kPa"),
         ([1.0, np.inf, 2.0], 0.3, "above 0 kPa"),
-        (1.0, 0.5, "-1 < nu < 0.5, got others in 3 cells"),
-        (1.0, [0.3, -1.0, 0.3], "got others in 1 cells, the first -1 in cell 1"),
+        (1.0, 0.5, "-1 < nu < 0.5, got other values in 3 cells"),
+        (1.0, [0.3, -1.0, 0.3], "got other values in 1 cells, the first -1 in cell 1"),
         (1.0, [0.3, np.nan, 0.3], "-1 < nu < 0.5"),
         ([1.0, 2.0], 0.3, "expected one value for each of 3 cells"),
     ],
@@ -93,7 +93,7 @@ def test_bins_that_are_none(count, spacing, match):
 def test_values_by_label():
     assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
     assert by_label(ByLabel({1: 2.5}, 7.0), np.array([0, 1, 9])).tolist() == [7.0, 2.5, 7.0]
-    with pytest.raises(InputError, match=r"got 1, the mesh also has 0, 3 \(2 more\); give values for these"):
+    with pytest.raises(InputError, match=r"got 1, but the mesh also has 0, 3 \(2 more\); give values for these"):
         by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
     with pytest.raises(InputError, match="has no labels"):
         by_label(ByLabel({1: 2.5}), None)
@@ -106,7 +106,7 @@ def test_values_by_name():
     assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [1.0, 2.5, 1.0, 4.0]
     with pytest.raises(InputError, match=r"label 3 \(left lung\) has two values"):
         by_label(ByLabel({3: 2.5, "left lung": 4.0}), labels, names)
-    with pytest.raises(InputError, match=r"got liver, the mesh also has 0 \(air\), 3 \(left lung\)"):
+    with pytest.raises(InputError, match=r"got liver, but the mesh also has 0 \(air\), 3 \(left lung\)"):
         by_label(ByLabel({"liver": 4.0}), labels, names)
     with pytest.raises(InputError, match="did you mean left lung"):
         by_label(ByLabel({"left lnug": 4.0}, 1.0), labels, names)
@@ -195,7 +195,7 @@ def test_cells_of_another_density_are_of_another_material():
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
 def test_densities_that_are_none(wrong):
-    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got others in 1 cells"):
+    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got other values in 1 cells"):
         materials(1.0, 0.3, 2, [1000.0, wrong])
     with pytest.raises(InputError, match="gravity: the cells have no density; give `density`"):
         density_of(materials(1.0, 0.3, 2))

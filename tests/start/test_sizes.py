@@ -426,7 +426,7 @@ def test_target_error_within_limits():
         (ball(30, 30, 30), {"target_error": 1.0}, "expected a fraction of the image's variance, 0 to 1"),
         (ball(30, 30, 30), {"target_error": float("nan")}, "expected a fraction"),
         (tetopt.Image(np.ones((30, 30, 30))), {"target_error": 0.1}, "the image is constant"),
-        (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise's fraction"),
+        (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise fraction"),
     ],
 )
 def test_targets_that_cannot_be(image, arguments, words):

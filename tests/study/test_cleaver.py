@@ -22,7 +22,7 @@ def test_unusable_package_is_told(monkeypatch):
     monkeypatch.setattr(cleaver, "find_spec", lambda name: name)
     python = cleaver._python
     monkeypatch.setattr(cleaver, "_python", lambda program: python("import os; os.kill(os.getpid(), 11)"))
-    with pytest.raises(tetopt.InputError, match=r"its import ends Python, signal 11, SIGSEGV; install"):
+    with pytest.raises(tetopt.InputError, match=r"importing it crashes Python \(signal 11, SIGSEGV\); install"):
         PIPELINES["cleaver"].function(PipelineInput(IMAGE, LABELS, 300))
 
 

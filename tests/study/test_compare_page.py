@@ -271,10 +271,10 @@ DERIVED = {
     (JUDGED, "largest label volume error"): lambda rows: max(
         abs(r.mesh_volume_mm3 / r.volume_mm3 - 1) for r in rows[1:3]
     ),
-    (JUDGED, "label area over smoothed voxels', mean by voxels"): lambda rows: np.average(
+    (JUDGED, "label area over smoothed voxels', weighted mean"): lambda rows: np.average(
         [r.area_ratio for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
     ),
-    (JUDGED, "label edges folded over 60°, mean by voxels"): lambda rows: np.average(
+    (JUDGED, "label edges folded over 60°, weighted mean"): lambda rows: np.average(
         [r.folded for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
     ),
     (JUDGED, "label edges in more than two facets"): lambda rows: sum(r.nonmanifold_edges for r in rows[1:3]),
@@ -377,7 +377,7 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
     """Its surface has no distance: the mean over the other labels would make losing it pay."""
     report = fake_report()
     lose(report.pipelines[0].runs[0], 2)
-    for title in ("mean label surface distance, mm", "label edges folded over 60°, mean by voxels"):
+    for title in ("mean label surface distance, mm", "label edges folded over 60°, weighted mean"):
         cell = measures(page_of(tmp_path, report))[JUDGED, title][0]
         assert cell == [{"tetopt", "lost"}, ["–", "no value"]]
 
@@ -587,7 +587,7 @@ def test_the_headline_is_a_handful_of_numbers(tmp_path):
     assert all(re.match("does not capture .{10}", texts[0][2]) for texts in first.values())
     assert not re.search(r"(best|loses) in \d+", page)
     titles = {criterion.title for criterion in criteria(report) if criterion.better == 0}
-    assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', mean by voxels", "λ max"}
+    assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', weighted mean", "λ max"}
     assert all(row.blind for row in criteria(report) if not row.is_detail and row.better)
 
 
@@ -652,8 +652,8 @@ def test_no_verdict_below_the_references_own_change(tmp_path, change, verdict):
     report = report._replace(reference=report.reference._replace(by_nu={"0.3": known}))
     claim = claim_of(report, DISPLACEMENT)
     assert (claim.verdict, claim.own_change) == (verdict, change)
-    is_void, why = verdict == "no verdict", "less than the reference's own change, 0.03"
-    known = why if is_void else f"reference's own change {change or 'not known'}"
+    is_void, why = verdict == "no verdict", "less than the reference's own error, 0.03"
+    known = why if is_void else f"reference's own error {change or 'not known'}"
     assert claim.beside == [known, "nodes 5000 and 5010"]
     first = headline(report)
     assert (DISPLACEMENT in {row.measure for row in first.behind_peers()}) != is_void
@@ -667,7 +667,7 @@ def test_no_verdict_below_the_references_own_change(tmp_path, change, verdict):
         ["0.104", f"1.3× the best{f', {why}' * is_void}"],
     ]
     strain = next(row for row in first.behind_peers() if row.measure.startswith("interface-strain error, ν = 0.3, lin"))
-    assert strain.beside[0] == "reference's own change not known"
+    assert strain.beside[0] == "reference's own error not known"
     assert not next(row for row in first.claims if row.group == "Image").beside[0].startswith("reference")
 
 
@@ -695,7 +695,7 @@ def test_no_verdict_on_time_and_memory_of_one_run(tmp_path, seconds, verdict):
     behind = {row.measure for row in first.behind_peers()}
     assert ({"wall time, s", "peak memory, MB"} <= behind) == (verdict == "worse")
     (remark,) = (
-        (line for line in first.remarks if line.startswith("A peer's number")) if verdict == "no verdict" else ("",)
+        (line for line in first.remarks if line.startswith("A peer is better")) if verdict == "no verdict" else ("",)
     )
     assert ("wall time, s (1.14×, one run each)" in remark) == (verdict == "no verdict")
     assert ("peak memory, MB (1.14×, one run each)" in remark) == (verdict == "no verdict")
@@ -767,7 +767,7 @@ def test_tetopt_can_fail(tmp_path):
     report = fake_report()
     report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out", reason="limit"), [])
     page = page_of(tmp_path, report)
-    assert "<strong>no mesh of tetopt&#39;s to compare: tetopt failed (timed out)</strong>" in page
+    assert "<strong>no tetopt mesh to compare: tetopt failed (timed out)</strong>" in page
     assert claims(page) == []
 
 

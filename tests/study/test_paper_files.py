@@ -200,7 +200,7 @@ def test_fem_bad_meshes(tmp_path, block, capsys):
         ),  # doubled nodes
         (points, np.vstack([cells] * 2), "overlap"),
         (points + np.array([1.0, 0.0, 0.0]), cells, "lie off the faces"),
-        (flat, cells, "flat or inverted, the first are [3, "),
+        (flat, cells, "flat or inverted, such as [3, "),
         (folded, cells, "facets cells overlap"),
     ):
         assert main(["fem", block[0], written(tmp_path, changed, joined)]) == 2

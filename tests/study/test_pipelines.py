@@ -12,7 +12,7 @@ LABELS = tetopt.Image((IMAGE.data > 50) + 2 * (np.indices(IMAGE.shape)[0] > 12),
 BOTH, ALONE = content(IMAGE, labels=LABELS), content(LABELS, labels=LABELS, weights=[0.0])
 EQUAL, AS_LABELS = (
     "meshed from the image and the given labels, equally weighted",
-    "the image is its labels: meshed as labels",
+    "the image is a label map: meshed as labels",
 )
 
 

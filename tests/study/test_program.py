@@ -106,7 +106,7 @@ def test_other_suffixes(tmp_path):
     """gmsh's own format, and a mesh that no number steers: one run, and a note."""
     made = by_program(JOB, mesher(tmp_path, lattice(400), words="{image} {output}.msh"))
     n = len(made.mesh.points)
-    assert made.notes == ["1 runs", f"{n} nodes, 1000 were requested; the runs gave {n}"]
+    assert made.notes == ["1 runs", f"{n} nodes instead of 1000; the runs gave {n}"]
     np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, IMAGE.data)
 
 
@@ -116,7 +116,7 @@ def test_a_count_that_cannot_be_met_is_told(tmp_path):
     made = by_program(JOB, mesher(tmp_path, mesh, mesh))
     n = len(mesh.points)
     first, *failures, last = made.notes
-    assert (first, last) == ("2 runs", f"{n} nodes, 1000 were requested; the runs gave {n}, {n}")
+    assert (first, last) == ("2 runs", f"{n} nodes instead of 1000; the runs gave {n}, {n}")
     assert len(failures) == 3
     assert all("nodes: mine ended with exit code 1: cp: " in line for line in failures)
 

@@ -90,7 +90,7 @@ def test_missed_count_is_told(monkeypatch):
     result = tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900)
     assert_fills(IMAGE, result.mesh)
     assert result.n_runs == tetwild.TETWILD_RUNS
-    assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild, 900 were requested"]
+    assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild; requested: 900"]
 
 
 @needs_pytetwild

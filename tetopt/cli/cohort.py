@@ -36,7 +36,7 @@ def cohort_command(
     cohort: CohortOptions,
     options: RunOptions,
 ) -> int:
-    """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
+    """Mesh many subjects from a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
     try:
         plan = plan_cohort(subjects, cohort, options)
     except Problems as problems:
@@ -126,7 +126,7 @@ class _CohortDisplay:
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
         out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
-            more = f"the page also shows {counted(n_more, 'subject')} more in {place}, from other tables"
+            more = f"the page also shows {counted(n_more, 'subject')} from other tables in {place}"
             log.print(escape(more))
         for name in (PAGE_NAME, TABLE_NAME):
             out.print(escape(str(place / name)))

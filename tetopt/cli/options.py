@@ -69,7 +69,7 @@ class ShownOptions:
     ] = None
     limits: Annotated[
         str | None,
-        Option("LOW,HIGH", "Range of its colours (default: all but 1 % at either end).", "range"),
+        Option("LOW,HIGH", "Range of the field's colours (default: all but 1 % at either end).", "range"),
     ] = None
     label_names: LabelNamesOption = None
 

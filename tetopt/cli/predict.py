@@ -27,9 +27,7 @@ def print_prediction(task: Task) -> None:
     n_bytes, fraction = prediction.peak_bytes, model.bytes_fraction
     out.print(f"{memory_words(n_bytes)} of memory at peak, in nine of ten cases within {fraction:.0%}")
     if task.plan.job.target_error is not None:
-        out.print(
-            f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many the error requires"
-        )
+        out.print(f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many the error needs")
     free = available_bytes()
     if n_bytes > free:
         show_warning(f"only {memory_words(free)} of memory is free, less than this run needs; reduce --nodes or crop")
@@ -46,9 +44,9 @@ def print_parts(task: Task) -> None:
     need = Need(number, n_bytes, job.threads, is_within=True)
     own = OCTREE_NODE_BYTES * nodes
     out.print(
-        f"about {counted(number, 'part')} per round, each up to {memory_words(n_bytes)} of memory, a worker "
-        f"{memory_words(need.limit_for(n_bytes))} in total; about {memory_words(own)} for this command, which builds "
-        "the octree in one piece"
+        f"about {counted(number, 'part')} per round, each up to {memory_words(n_bytes)} of memory "
+        f"({memory_words(need.limit_for(n_bytes))} with its worker); about {memory_words(own)} for this command, "
+        "which builds the octree in one piece"
     )
     free = available_bytes()
     if own > free:

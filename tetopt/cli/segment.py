@@ -21,7 +21,7 @@ from tetopt.system.files import checked_output
 
 def segment_command(
     image_path: ImageArgument,
-    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or MSH file over the image.", is_argument=True)],
+    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or MSH file of the image's mesh.", is_argument=True)],
     output: Annotated[Path, Option("LABELS.nii.gz", "The labels to write.", letter="o")],
     classes: Annotated[int, Option("K", "Number of classes, in order of increasing mean.", least=2)] = 4,
     truth_path: Annotated[
@@ -31,7 +31,7 @@ def segment_command(
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
-    """Segment an image by its mesh, fast and roughly: group cells by mean into K classes and label their voxels."""
+    """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and label their voxels."""
     from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)

@@ -27,7 +27,9 @@ from tetopt.system.incoming import json_of
 
 def view_command(
     mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra.", is_argument=True)],
-    image_path: Annotated[Path | None, Option("IMAGE", "Show its slice behind the mesh's section.", "image")] = None,
+    image_path: Annotated[
+        Path | None, Option("IMAGE", "Show this image's slice behind the mesh's section.", "image")
+    ] = None,
     *,
     how: ShownOptions,
     part: BoxPart,

@@ -294,7 +294,7 @@ def _demand(newcomers: Newcomers, logs: Path) -> Any:
             self.asked_at = time.monotonic()
             slots = newcomers.slots()
             if slots == 0 and self.n_lost >= MOST_LOST:
-                raise InputError(f"`cluster`: {self.n_lost} jobs ended at their start; see their logs in {logs}")
+                raise InputError(f"`cluster`: {self.n_lost} jobs ended right after starting; see their logs in {logs}")
             return slots
 
         async def target(self) -> int:

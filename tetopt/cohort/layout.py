@@ -96,7 +96,7 @@ def check_out(out: Path) -> None:
 def not_our_file(path: Path) -> str | None:
     """Return the problem of a file of tetopt's, if it is a link, a pipe or the like."""
     other = irregular(path, follow=False) if os.path.lexists(path) else None
-    return other and f"{path}: expected a regular file, got {other}; replace it by the file itself, or remove it"
+    return other and f"{path}: expected a regular file, got {other}; replace it with the file itself, or remove it"
 
 
 def not_our_files(out: Path, key: str) -> str | None:
@@ -108,7 +108,7 @@ def not_our_picture(out: Path, key: str) -> str | None:
     """Return the problem of a subject's thumbnail, and of its folder, which tetopt makes inside the subject's."""
     path = thumbnail_path(out, key)
     if path.parent.is_symlink():
-        return f"{path.parent}: expected a folder, got a link; replace it by the folder itself, or remove the link"
+        return f"{path.parent}: expected a folder, got a link; replace it with the folder itself, or remove the link"
     return not_our_file(path)
 
 

@@ -150,7 +150,7 @@ def _row_of_run(out: Path, row: Row, run: dict[str, Any]) -> Row:
     meshes = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json")
     mesh = min(meshes, default=None)
     if mesh is None:
-        return row._replace(status="failed", reason="its mesh is missing, though there are numbers; run it again")
+        return row._replace(status="failed", reason="its numbers exist, but its mesh is missing; run it again")
     violated = run["violated"] if isinstance(run.get("violated"), dict) else {}
     labels = [each for each in _table(run, "labels") if isinstance(each.get("label"), int)]
     names = run["label_names"] if isinstance(run.get("label_names"), dict) else {}

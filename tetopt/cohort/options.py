@@ -15,7 +15,7 @@ class CohortOptions:
     """Selection of subjects, outputs and workers of a cohort."""
 
     panel: ClassVar[str] = "Cohort"
-    output: Annotated[Path, Option("OUT", "Folder of all outputs; an earlier run there is resumed.", letter="o")]
+    output: Annotated[Path, Option("OUT", "Folder for all outputs; an earlier run there is resumed.", letter="o")]
     suffix: Annotated[str, Option("WORD", 'BIDS folder: suffix of its images, or with entities "acq-mprage_T1w".')] = (
         "T1w"
     )

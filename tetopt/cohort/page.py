@@ -110,7 +110,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     if n_odd := sum(bool(each) for each in flags):
         text += f" {n_odd} {'is' if n_odd == 1 else 'are'} flagged, see below."
     if seconds := present(row.numbers.get("seconds.all") for row in rows):
-        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing, without start-up and pictures."
+        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing, excluding start-up and pictures."
     if peaks := present(row.numbers.get("memory.peak_bytes") for row in rows):
         text += f" The largest run used {units('bytes', 3)(max(peaks))} of memory."
     options = _options(rows)
@@ -120,7 +120,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     if common:
         lines.append(f"Common to all meshes: {', '.join(common)}.")
     if different:
-        lines.append(f"Different, with numbers of subjects: {'; '.join(different)}.")
+        lines.append(f"Differences, with numbers of subjects: {'; '.join(different)}.")
     return lines
 
 

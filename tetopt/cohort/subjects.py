@@ -122,7 +122,7 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
     for name, place in places.items():
         if "_ses-" in name and name.partition("_")[0] in places:
             bare = name.partition("_")[0]
-            yield f"{place}: {name} has a session, {bare} ({places[bare]}) has none; add a session to both"
+            yield f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; add a session to both"
 
 
 def table_text(path: Path, subjects: Sequence[Subject]) -> str:

@@ -272,7 +272,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         )
     if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
-        raise InputError(f"{name}: the mask is empty, expected voxels of {INSIDE_FRACTION} or more, got {largest}")
+        raise InputError(f"{name}: the mask is empty: expected voxels of {INSIDE_FRACTION} or more, got {largest}")
     return data.astype(np.float32)
 
 

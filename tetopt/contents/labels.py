@@ -36,8 +36,8 @@ def check_labels(name: str, labels: Image) -> None:
     if len(wrong):
         first = tuple(int(i) for i in wrong[0])
         raise InputError(
-            f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}, {len(wrong)} voxels have others, the "
-            f"first {data[first]:g} at {first}; is it a label image?"
+            f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}; {len(wrong)} voxels have other "
+            f"values, the first {data[first]:g} at {first}: is it a label image?"
         )
 
 

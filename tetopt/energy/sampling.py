@@ -443,7 +443,7 @@ def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np
     wrong = np.flatnonzero(orientations(ticks, cells) != hand)
     if len(wrong):
         raise InputError(
-            f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, the first are "
+            f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, such as "
             f"{wrong[:5].tolist()}; remove or repair them before sampling"
         )
 

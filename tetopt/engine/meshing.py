@@ -410,7 +410,7 @@ def meshed_to_error(
     noise = content.noise * content.unit / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's fraction, estimated as {noise:.3g}, "
+            f"target_error: {target_error:g} of the variance is below the noise fraction, estimated as {noise:.3g}, "
             "so cells would have to follow the noise; use a larger fraction, or denoise the image"
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]

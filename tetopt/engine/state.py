@@ -35,7 +35,7 @@ def state_of(
     flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
     if len(flat):
         raise InputError(
-            f"mesh: {len(flat)} cells are too flat to optimise, the first are {flat[:5].tolist()}; "
+            f"mesh: {len(flat)} cells are too flat to optimise, such as {flat[:5].tolist()}; "
             "remove them or move their nodes apart"
         )
     E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)

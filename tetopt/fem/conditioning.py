@@ -139,7 +139,7 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
         solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
         if failure:
-            raise RuntimeError("conditioning: the smallest eigenvalue did not converge, as a solve did not")
+            raise RuntimeError("conditioning: the smallest eigenvalue did not converge, because a solve did not")
         return solution
 
     return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but converges if moduli differ widely

@@ -342,7 +342,7 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
     if not on_box.all():
         inner = np.flatnonzero(~on_box)
         raise InputError(
-            f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
+            f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box; the first has nodes "
             f"{outer[inner[0]].tolist()}: it has a crack or several components, or belongs to another image or crop"
         )
     filled = filled_fraction(mesh, image)
@@ -394,7 +394,7 @@ def constrained(
     values = np.where(is_prescribed, prescribed, 0.0)
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-        raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
+        raise InputError(f"prescribed: displacements must be finite, but node {node} has {values[node].tolist()}")
     check_unfolded(mesh)
     points = elements.points @ frame
     is_sprung = np.zeros(len(points), dtype=bool) if outside is None else outside.springs > 0.0
@@ -575,7 +575,7 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_FRACTION * float(np.linalg.norm(system.load))
         if not residual <= allowed:
-            raise RuntimeError(f"elasticity: not solved, the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
+            raise RuntimeError(f"elasticity: not solved: the residual {residual:.3g} mN exceeds {allowed:.3g} mN")
         dofs[system.free] = solution
     return dofs.reshape(-1, n) @ system.frame.T, n_steps
 

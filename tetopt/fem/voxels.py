@@ -196,7 +196,7 @@ def solve_voxels(grid: Grid, u: NDArray[np.float64], residual_fraction: float = 
     residual = _norm(_free(q, plates))
     if not residual <= 10.0 * residual_fraction * load:
         raise RuntimeError(
-            f"reference: not solved, the residual {residual:.3g} mN exceeds {10.0 * residual_fraction * load:.3g} mN"
+            f"reference: not solved: the residual {residual:.3g} mN exceeds {10.0 * residual_fraction * load:.3g} mN"
         )
     return Work(iterations, residual / load)
 

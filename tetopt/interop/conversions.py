@@ -118,7 +118,7 @@ def simplices_of(
     n = cells.shape[1] - 1
     nodes = cells if middles is None else np.column_stack([cells, middles])
     if nodes.min() < 0 or nodes.max() >= len(points):
-        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, it has 0..{len(points) - 1}; damaged?")
+        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, but it has 0..{len(points) - 1}; damaged?")
     if n == 2 and np.any(points[nodes, 2] != 0.0):
         raise InputError("a triangle mesh must lie in the plane z = 0; surfaces in space are not supported")
     used, compact = np.unique(cells, return_inverse=True)
@@ -157,7 +157,9 @@ def cells_of_rows(
     for kind, chosen in rows_of_kind.items():
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
-            raise InputError(f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, some have another number")
+            raise InputError(
+                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have another number"
+            )
         cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
     return cells
 

@@ -624,7 +624,7 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
     if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
         raise InputError(
             f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} voxels, "
-            f"{n_bytes:.4g} bytes, the file has {size})"
+            f"{n_bytes:.4g} bytes, but the file has {size})"
         )
     most = proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES
     if is_packed:

@@ -63,7 +63,7 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
             f"{DAMAGED_FILE} (its header declares {sizes} voxels, "
-            f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
+            f"{header.value_bytes:.4g} bytes, but the file has {n_bytes})"
         )
     longest = VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
     skipped = int(header.skip) if header.skip.isdecimal() else 0

@@ -59,7 +59,7 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
     is_whole &= all(len(each) == len(grid.points) for each in grid.point_data.values())
     is_whole &= all(len(each) == n for each in grid.cell_data.values())
     if not is_whole or (np.diff(starts) < 0).any():
-        raise InputError("damaged: its cells, or its data, do not fit together")
+        raise InputError("damaged: its cells or data are inconsistent")
     return grid
 
 
@@ -77,7 +77,7 @@ def check_counts(path: Path) -> None:
             name, number = match[1].decode("latin-1"), float(match[2])
             if not 0 <= number <= most:
                 count = match[2][:40].decode()
-                raise InputError(f"damaged: {name[:40]} is {count}, its {size} bytes can hold at most {most}")
+                raise InputError(f"damaged: {name[:40]} is {count}, but its {size} bytes can hold at most {most}")
 
 
 # In the child

@@ -191,7 +191,7 @@ class _Guarded:
         stored = int(each.id.get_storage_size())
         if stored > self.size or n_bytes > stored * (DEFLATE_RATIO if DEFLATE_FILTER in filters else 1):
             raise InputError(
-                f'damaged: "{shown}" should have {n_bytes} bytes, the file stores {stored} of a total of {self.size}'
+                f'damaged: "{shown}" should have {n_bytes} bytes, but the file stores {stored} of {self.size}'
             )
         if h5py.check_string_dtype(each.dtype) is not None:
             return np.array(each.asstr(errors="backslashreplace")[()], dtype=np.str_)
@@ -253,7 +253,7 @@ def _joined(
     n_points, _, n_nodes, n_offsets = (np.array(counts[name], dtype=np.int64) for name in ARRAYS)
     ends = np.cumsum(n_offsets)
     if (offsets[ends - n_offsets] != 0).any() or (offsets[ends - 1] != n_nodes).any():
-        raise InputError("damaged: its cells, or its data, do not fit together")
+        raise InputError("damaged: its cells or data are inconsistent")
     sizes = np.delete(np.diff(offsets), ends[:-1] - 1)
     if len(n_points) > 1:
         if ((nodes < 0) | (nodes >= np.repeat(n_points, n_nodes))).any():

@@ -49,7 +49,7 @@ def unpacked(name: str, packed: bytes, n_bytes: int) -> bytes:
         value = place.tobytes()
     if len(value) != n_bytes:
         count = f"more than {n_bytes}" if len(value) > n_bytes else str(len(value))
-        raise ValueError(f"a chunk unpacks to {count} bytes, the array declares {n_bytes}")
+        raise ValueError(f"a chunk unpacks to {count} bytes, but the array declares {n_bytes}")
     return value
 
 

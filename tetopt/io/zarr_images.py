@@ -350,7 +350,7 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"its chunk {name} is not a regular file; copy its data into a file")
         if status.st_size > most_bytes:
-            raise InputError(f"its chunk {name} has {status.st_size} bytes, not at most {most_bytes}; copy it again")
+            raise InputError(f"its chunk {name} has {status.st_size} bytes, more than {most_bytes}; copy it again")
     if n_missing == 0:
         return
     if n_missing == n_chunks:

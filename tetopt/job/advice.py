@@ -68,7 +68,7 @@ def _lost(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         warning(
-            f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: elements are too large for them, or this is "
+            f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: elements are too large, or this is "
             "not a label image; allow more nodes, or follow every voxel with `smooth_interfaces` 0"
         )
 

@@ -39,7 +39,7 @@ class Event(NamedTuple):
 
     Examples
     --------
-    >>> tetopt.Event("note", "the image is its own labels: only these count").kind
+    >>> tetopt.Event("note", "the image is also the label image: only the labels are used").kind
     'note'
     """
 

@@ -72,8 +72,8 @@ def with_parts(plan: Plan) -> Plan:
                 note(f"`{name}` is ignored: the mesh is built in one piece (use `parts` to partition it)")
             return plan
         note(
-            f"meshing in one piece would take {memory_words(needed)} of memory, {memory_words(free)} is free: the "
-            "mesh is built in parts"
+            f"meshing in one piece would take {memory_words(needed)} of memory, but only {memory_words(free)} is free: "
+            "building the mesh in parts"
         )
     elif unsupported is not None:
         raise InputError(unsupported)
@@ -236,8 +236,8 @@ def _check_room(need: Need, room: float) -> None:
     """Raise InputError if a part needs more memory than its worker has."""
     if need.task_bytes > room:
         raise InputError(
-            f"a part needs about {memory_words(need.task_bytes)} of memory, its worker "
-            f"{memory_words(need.limit_for(need.task_bytes))} in total, and has less; increase `parts`, reduce "
+            f"a part needs about {memory_words(need.task_bytes)} of memory, and its worker "
+            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than it has; increase `parts`, reduce "
             "`workers`, or give them more memory"
         )
 

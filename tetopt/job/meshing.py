@@ -169,7 +169,7 @@ def watched(
         result = result._replace(ended="max_gb")
     if result.ended != "iterations":
         started("optimised", "optimised")
-        words = ended_words(result.ended, "the mesh so far")
+        words = ended_words(result.ended, "the current mesh")
         note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result
 
@@ -186,7 +186,7 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
-            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes with mid-edge ones, of "
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes, mid-edge ones included, of "
             f"{job.nodes}; accepted: within {NODES_NEAR:.0%}"
         )
 

@@ -186,7 +186,7 @@ class SizeOptions:
         str | None,
         Option(
             "LABEL=SIZE,...",
-            'Target edge by label or name, mm, or as a part of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
+            'Target edge by label or name, mm or a fraction of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
             "or a .toml or .csv file.",
         ),
     ] = None
@@ -266,8 +266,10 @@ class EngineOptions:
         ),
     ] = None
     threads: Annotated[int | None, Option("N", "Number of threads; the result does not depend on it.")] = None
-    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the mesh so far.")] = None
-    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the mesh so far.")] = None
+    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the current mesh.")] = None
+    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the current mesh.")] = (
+        None
+    )
 
 
 WorkersOption = Annotated[

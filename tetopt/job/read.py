@@ -91,4 +91,4 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
     if not is_in.any():
         raise InputError(f"{path}: the mesh lies outside the image; are both in the same world coordinates, mm (RAS+)?")
     if not is_in.all():
-        warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, which does not affect them")
+        warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not affected by it")

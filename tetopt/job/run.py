@@ -80,7 +80,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     on : callable, optional
         Called with each `Event`; without it, warnings and violated requirements are Python's warnings.
     stop : callable, optional
-        Called between colours of nodes; True ends the run with the mesh so far.
+        Called between colours of nodes; True ends the run with the current mesh.
 
     Returns
     -------

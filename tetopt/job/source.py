@@ -134,7 +134,8 @@ def read_source(
         )
     balance = balance_of(options)
     if options.weights is None and is_own:
-        note(f"the image is {'its own labels' if tissues is None else 'one of the tissues'}: only these are used")
+        whose, used = ("the label image", "labels") if tissues is None else ("one of the tissues", "tissues")
+        note(f"the image is also {whose}: only the {used} are used")
         balance = balance._replace(weights=[0.0])
     represented = content(
         contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),

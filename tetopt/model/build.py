@@ -236,7 +236,7 @@ def _varying_moduli(
     if image is None or not (callable(mapping) or np.ndim(mapping) == 2):
         return None, None
     if place == "nodes" and bins is not None:
-        raise InputError(f"bins: moduli that vary within cells cannot be grouped; use another average than {average}")
+        raise InputError(f"bins: moduli that vary within cells cannot be grouped; use an average other than {average}")
     return (
         node_young(image, mesh, mapping) if place == "nodes" else None,
         element_young(image, mesh, mapping, average, order)

@@ -195,7 +195,7 @@ def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Mode
     table = table._replace(binning=_binning_error(loaded))
     at_gauss = _gauss_moduli(model, loaded)
     lost = at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data
-    words = f"dropped {GAUSS_MODULI} of the mesh's file: it does not match the cells and their young"
+    words = f"dropped {GAUSS_MODULI} from the mesh's file: it does not match the cells and their moduli"
     return model._replace(materials=table, gauss_young=at_gauss), words if lost else ""
 
 

@@ -292,7 +292,7 @@ def _columns(path: Path) -> dict[str, list[Any]]:
 def _toml_columns(path: Path) -> dict[str, list[Any]]:
     columns = toml_of(path, "table")
     if wrong := [name for name, column in columns.items() if not isinstance(column, list)]:
-        raise InputError(f'{path}: expected lists of numbers, "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
+        raise InputError(f'{path}: expected lists of numbers, but "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
     return columns
 
 

@@ -98,8 +98,8 @@ def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike 
     outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
     if len(outside):
         raise InputError(
-            f"nu: expected -1 < nu < 0.5, got others in {len(outside)} cells, the first {columns[1][outside[0]]:g} "
-            f"in cell {outside[0]}; for nearly incompressible tissue use 0.45 to 0.49"
+            f"nu: expected -1 < nu < 0.5, got other values in {len(outside)} cells, the first "
+            f"{columns[1][outside[0]]:g} in cell {outside[0]}; for nearly incompressible tissue use 0.45 to 0.49"
         )
     if density is not None:
         columns.append(_checked_density(_of_cells("density", density, n_cells)))
@@ -113,8 +113,8 @@ def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
     bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
     if len(bad):
         raise InputError(
-            f"density: expected kg/m3 above 0, got others in {len(bad)} cells, the first {density[bad[0]]:g} in cell "
-            f"{bad[0]}; water has 1000"
+            f"density: expected kg/m3 above 0, got other values in {len(bad)} cells, the first "
+            f"{density[bad[0]]:g} in cell {bad[0]}; water has 1000"
         )
     return density
 
@@ -180,7 +180,7 @@ def by_label(
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
     if missing and mapping.rest is None:
         raise InputError(
-            f"values by label: got {', '.join(map(str, mapping.values))}, the mesh also has {', '.join(missing)} "
+            f"values by label: got {', '.join(map(str, mapping.values))}, but the mesh also has {', '.join(missing)} "
             f"({len(missing)} more); give values for these, or *=VALUE for all others"
         )
     return np.array([values.get(label, mapping.rest) for label in kinds.tolist()], dtype=np.float64)[which.ravel()]

@@ -276,11 +276,11 @@ def odd_units(model: Model) -> Iterator[str]:
                 "multiply it by 1000; `units` affects only the output file"
             )
         if table.density is not None and (densest := float(table.density.max())) < GRAM_DENSITY_MOST:
-            yield f"density is at most {densest:.4g} kg/m3, water has 1000: if it is in g/cm3, multiply it by 1000"
+            yield f"density is at most {densest:.4g} kg/m3 (water: 1000): if it is in g/cm3, multiply it by 1000"
     for load in model.loads:
         size = float(np.sqrt((load.numbers**2).sum()))
         if load.kind == "gravity" and METRE_GRAVITY[0] <= size <= METRE_GRAVITY[1]:
-            yield f"gravity is {size:.4g} mm/s2, the earth's is 9810: if it is in m/s2, multiply it by 1000"
+            yield f"gravity is {size:.4g} mm/s2 (the earth's: 9810): if it is in m/s2, multiply it by 1000"
 
 
 def locking_words(model: Model) -> str:

@@ -394,7 +394,7 @@ def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | No
         raise InputError(f"set {name}: the mesh has no cell means; give the image (`image`)")
     chosen = largest_component(mesh.cells, mean < threshold)
     if len(chosen) == 0:
-        raise InputError(f"set {name}: no cell has a mean below {threshold:g}, the lowest is {mean.min():g}")
+        raise InputError(f"set {name}: no cell has a mean below {threshold:g}; the lowest is {mean.min():g}")
     return chosen
 
 

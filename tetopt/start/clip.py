@@ -49,7 +49,7 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     is_flat = ~(is_inside | is_outside)
     is_inside[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1)) < 0.0
     if not is_inside.any():
-        raise InputError("mask: it is thinner than the cells, so none is left inside; increase the number of nodes")
+        raise InputError("mask: it is thinner than the cells, so no cell is left inside; increase the number of nodes")
     used, kept = compact(cells[is_inside], len(index))
     return Mesh(image.to_world(index[used]), kept)
 

@@ -115,7 +115,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
         notes.append(f"{n_removed} cells outside the box removed")
     n_nodes = node_count(points, cells, order)
     if not is_near(n_nodes, nodes):
-        notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver, {nodes} were requested")
+        notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver; requested: {nodes}")
     world = image.to_world(points / image.spacing)
     return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
 
@@ -133,7 +133,7 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     probe = _python("from itk import CleaverImageToMeshFilter")
     if probe.returncode != 0:
-        raise InputError(f"itk-cleaver: its import ends Python, {_ending(probe)}; {INSTALL_HINT}")
+        raise InputError(f"itk-cleaver: importing it crashes Python ({_ending(probe)}); {INSTALL_HINT}")
 
 
 def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:

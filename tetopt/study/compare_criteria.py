@@ -99,7 +99,7 @@ def _shape_criteria() -> list[Criterion]:
     return [
         row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail (1/3: regular tetrahedron)"),
         row("p1 rho", ("p1_rho",), 1, "the worst 1 % of the cells"),
-        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells are near it: it is one cell's angle"),
+        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells come close: it is one cell's angle"),
         Criterion("Shape", "Shape", "bad cells (3 rho < 0.3), %", bad_percent, -1, is_headline=True,
             blind="how bad they are, and their kind: slivers harm a stiffness matrix more than needles (below)"),
         row("min rho", ("min_rho",), 1),
@@ -143,8 +143,8 @@ def _label_criteria(report: Report) -> list[Criterion]:
         ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is: lost and gained "
             "parts cancel each other"),
         ("labels lost (of any size)", _n_lost, -1, "labels that keep a single cell"),
-        ("label area over smoothed voxels', mean by voxels", by_voxels(attrgetter("area_ratio")), 0, ""),
-        ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1, ""),
+        ("label area over smoothed voxels', weighted mean", by_voxels(attrgetter("area_ratio")), 0, ""),
+        ("label edges folded over 60°, weighted mean", by_voxels(attrgetter("folded")), -1, ""),
         ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1, ""),
         ("of these, where two labels meet", over(sum, attrgetter("nonmanifold_edges_two_labels")), -1, ""),
         ("labels with more or fewer components", over(sum, lambda row: row.mesh_components != row.components), -1, ""),
@@ -264,7 +264,7 @@ def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str
     if criterion.own_change is None or first is None or second is None:
         return ""
     is_below = abs(first - second) < criterion.own_change
-    return f"less than the reference's own change, {short_text(criterion.own_change)}" if is_below else ""
+    return f"less than the reference's own error, {short_text(criterion.own_change)}" if is_below else ""
 
 
 def winners(better: int, values: Sequence[float | None]) -> list[int]:

@@ -38,8 +38,8 @@ from tetopt.system.files import results_folder, save_json
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {
     "slices.png": "The same slice through every mesh; the mean of the image in each cell; E_D of each cell",
-    "quadratic.png": "The same slice through the coarser meshes whose quadratic cells have as many nodes in total",
-    "cutaways.png": "Cutaways, cells in the grey of their mean",
+    "quadratic.png": "The same slice through the coarser meshes whose quadratic cells have equally many nodes in total",
+    "cutaways.png": "Cutaways, cells shaded by mean intensity",
     "labels.png": "Every label, by size: Dice, and mean distance between its surfaces in mesh and image; lost labels "
     "have Dice 0 and no distance",
     "histograms.png": "Radius ratio rho and dihedral angles",

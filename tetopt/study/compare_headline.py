@@ -139,7 +139,7 @@ def _beside(row: Criterion, pipelines: list[PipelineResult], places: tuple[int, 
     words = [why] if why else []
     if row.is_error and not why:  # which states it
         change = "not known" if row.own_change is None else short_text(row.own_change)
-        words.append(f"reference's own change {change}")
+        words.append(f"reference's own error {change}")
     nodes = [number_text(each.n_nodes) for place in places if (each := _measured(pipelines[place])) is not None]
     if len(set(nodes)) > 1:
         words.append(f"nodes {' and '.join(nodes)}")
@@ -158,7 +158,7 @@ def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
         if claim.verdict == "no verdict" and claim.other_kind == "peer" and claim.is_lost
     ]
     if lost:
-        yield f"A peer's number is better, without a verdict: {'; '.join(lost)}."
+        yield f"A peer is better, but without a verdict: {'; '.join(lost)}."
 
 
 def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verdict:
@@ -188,7 +188,7 @@ def _title(report: Report, ours: int | None, peers: list[int]) -> str:
     void = [failure_words(each) for each in tried if each.median is None]
     if ours is None:
         failed = [failure_words(each) for each in report.pipelines if each.kind == "tetopt"]
-        return f"no mesh of tetopt's to compare: {'; '.join(failed) or 'none of its pipelines was requested'}"
+        return f"no tetopt mesh to compare: {'; '.join(failed) or 'none of its pipelines was requested'}"
     title = report.pipelines[ours].title
     if not peers:
         return f"{title} against no peer: {'; '.join(void) or 'none was requested'}"
@@ -212,8 +212,8 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
         remarks.append(
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges, or below "
             f"{EQUAL_FRACTION:.1%}, does not count; a single run has no range. An error has no verdict if the "
-            "meshes differ by less than the reference does from its own half resolution; nor have time and memory "
-            "of single runs."
+            "meshes differ by less than the reference differs from its solution at half the resolution. Time and "
+            "memory of single runs have no verdict either."
         )
     for order, word in ORDER_WORDS.items():
         for each in of_order(report, order):

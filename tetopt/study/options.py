@@ -15,7 +15,7 @@ from tetopt.study.program import Program, parse_program
 from tetopt.system.budget import BYTES_PER_GB
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-ClassesOption = Annotated[int, Option("K", "Classes of the segmentation (multi-Otsu).", least=2)]
+ClassesOption = Annotated[int, Option("K", "Number of segmentation classes (multi-Otsu).", least=2)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +26,12 @@ class ComparedOptions:
     nodes: Annotated[int, Option("N", "Target number of nodes of every mesh.", least=20)] = DEFAULT_SETTINGS.nodes
     labels: Annotated[Path | None, Option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
     label_names: LabelNamesOption = None
-    repeats: Annotated[int, Option("R", "Runs of a mesher whose result varies.", least=1)] = DEFAULT_SETTINGS.repeats
-    pipelines: Annotated[str, Option("A,B,...", f"In order, from {', '.join(PIPELINES)}.")] = ",".join(PIPELINES)
+    repeats: Annotated[int, Option("R", "Number of runs for meshers whose result varies.", least=1)] = (
+        DEFAULT_SETTINGS.repeats
+    )
+    pipelines: Annotated[str, Option("A,B,...", f"Pipelines, in order: some of {', '.join(PIPELINES)}.")] = ",".join(
+        PIPELINES
+    )
     programs: Annotated[
         list[str] | None,
         Option(
@@ -51,15 +55,16 @@ class SimulationOptions:
 
     panel: ClassVar[str] = "Simulation"
     young: Annotated[
-        str | None, Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
+        str | None,
+        Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over the image's range."),
     ] = None
     average: Annotated[str, AVERAGE_OPTION] = DEFAULT_SETTINGS.average
     reference_seconds: Annotated[
-        float | None, Option("S", "Time for the reference on the voxel grid, made as fine as fits. Default: 120.")
+        float | None, Option("S", "Time for the voxel reference, made as fine as this allows. Default: 120.")
     ] = None
-    reference_dofs: Annotated[int | None, Option("D", "Exact size of that grid, instead of a time.", least=1000)] = (
-        DEFAULT_SETTINGS.reference_dofs
-    )
+    reference_dofs: Annotated[
+        int | None, Option("D", "Exact number of unknowns of the reference, instead of a time.", least=1000)
+    ] = DEFAULT_SETTINGS.reference_dofs
 
 
 @dataclass(frozen=True, kw_only=True)

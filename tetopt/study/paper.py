@@ -207,7 +207,7 @@ def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
         raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
     if not np.isfinite(strain).all():
         raise InputError(
-            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them (by 0 where the "
+            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them (with 0 where the "
             "tissue is stiff)"
         )
     return 1.0 / np.maximum(np.abs(strain), floor)

@@ -120,7 +120,7 @@ def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Con
     with _timed(seconds, "labels"):
         if np.array_equal(job.image.data, job.labels.data):
             # Label numbers are meaningless as intensities: label 9 is no farther from 1 than label 2.
-            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
+            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is a label map: meshed as labels"]
         return content(job.image, labels=job.labels), ["meshed from the image and the given labels, equally weighted"]
 
 
@@ -188,7 +188,7 @@ PIPELINES = {
         partial(ours, mode="paper"),
     ),
     "pytetwild": Pipeline(
-        "pytetwild", "peer", "classes by multi-Otsu or given labels, their surfaces, fTetWild sized by them",
+        "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
         pytetwild, is_random=True,
     ),
     "cleaver": Pipeline("itk-cleaver", "peer", "the same labels, Cleaver", cleaver),

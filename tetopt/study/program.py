@@ -139,7 +139,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
     loaded = runs[0].result
     if not is_near(runs[0].n_nodes, job.nodes):
         counts = ", ".join(map(str, sizes))
-        notes.append(f"{runs[0].n_nodes} nodes, {job.nodes} were requested; the runs gave {counts}")
+        notes.append(f"{runs[0].n_nodes} nodes instead of {job.nodes}; the runs gave {counts}")
     mesh, kept, on_box = boxed(job.image, loaded.mesh)
     labels, of_labels = _own_labels(loaded, kept, job)
     seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}

@@ -111,7 +111,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         world = image.to_world(points / image.spacing)
         n_nodes = node_count(points, cells, order)
         if not is_near(n_nodes, nodes):
-            notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild, {nodes} were requested")
+            notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild; requested: {nodes}")
         search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
     raise InputError(f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes")

@@ -50,12 +50,12 @@ def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = N
     free = available_bytes()
     if n_bytes > free:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes)} of memory, {memory_words(free)} is free; {advice}"
+            f"{what}: needs about {memory_words(n_bytes)} of memory, but only {memory_words(free)} is free; {advice}"
         )
     if limit is not None and n_bytes + resident_bytes() > limit:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in total, "
-            f"{memory_words(limit)} is allowed; {advice}"
+            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in total, but "
+            f"only {memory_words(limit)} is allowed; {advice}"
         )
 
 
@@ -78,7 +78,7 @@ def check_addresses() -> None:
     room = address_room()
     if room is not None and room < LIBRARY_ADDRESSES:
         raise InputError(
-            f"the process limit leaves {memory_words(room)} of address space, numba and other libraries need "
+            f"the process limit leaves {memory_words(room)} of address space, but numba and other libraries need "
             f"{memory_words(LIBRARY_ADDRESSES)}; raise the limit (ulimit -v, ulimit -d)"
         )
 

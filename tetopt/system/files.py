@@ -173,7 +173,7 @@ def check_space(path: Path, n_bytes: int) -> None:
     """Raise InputError if the disk of `path` has fewer than `n_bytes` bytes free, as far as it reports them."""
     free = shutil.disk_usage(os.path.realpath(path.parent)).free
     if free < n_bytes:
-        raise InputError(f"{path}: needs at least {n_bytes} bytes, {free} are free; free some space first")
+        raise InputError(f"{path}: needs at least {n_bytes} bytes, but only {free} are free; free some space first")
 
 
 @contextmanager
