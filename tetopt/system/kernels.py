@@ -70,10 +70,6 @@ POLLED_SECONDS = 0.1  # between polls of compiling processes
 LONGEST_WAIT_SECONDS = 600.0  # for another run to compile: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each imports numba first, 1 s and 200 MB
 
-# Before numba loads OpenMP: its threads sleep while they wait, rather than spin. Two runs at a time on two cores take
-# 1.5 s each instead of 11 (500 nodes with labels); alone, a run of 15,000 nodes takes 15.3 instead of 19 CPU seconds.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 _LINKING = threading.RLock()  # one Python thread links at a time, and the others call its code
 _links: list[Any] = []  # the result of `links`, once it is known
 
