@@ -172,7 +172,7 @@ def move_figure() -> Figure:
     middle.plot(*first, "o", color=CURVE_COLOURS[1])
     middle.set_aspect("equal")
     middle.set_axis_off()
-    middle.set_title("E by the place of the node", fontsize=10)
+    middle.set_title("E as a function of the node's position", fontsize=10)
     means_panel(right, image, after, f"after: E = {energies[least]:.2f}")
     return figure
 
