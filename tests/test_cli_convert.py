@@ -275,7 +275,7 @@ def test_what_formats_do_not_hold_as_it_is_is_said(folder, tmp_path, capsys):
     [
         (["--young", "3500"], "young is 3500 to 3500 kPa, stiffer than soft tissue"),
         (["--young", "0.003"], "young is at most 0.003 kPa, softer than any tissue"),
-        (["--young", "3", "--density", "1.06"], "density is at most 1.06 kg/m3, water has 1000"),
+        (["--young", "3", "--density", "1.06"], "density is at most 1.06 kg/m3 (water: 1000)"),
         (["--young", "3", "--density", "1060", "--load", "gravity:0,0,-9.81"], "gravity is 9.81 mm/s2"),
         (["--young", "0=17e6,1=1e5", "--density", "1=1000,0=1.2", "--load", "gravity:0,0,-9810"], None),
     ],

@@ -245,4 +245,4 @@ def test_moduli_at_gauss_points_go_through_the_file(units, tmp_path, capsys):
     fields = dict(loaded.cell_data) | {"young": 2.0 * loaded.cell_data["young"]}
     tetopt.save_mesh(tmp_path / "changed.vtu", loaded.mesh, fields, {"loads": ["compress:5%"], "units": "kPa"}, order=2)
     _, err = run(capsys, str(tmp_path / "changed.vtu"), "--load", "compress:1%")
-    assert "dropped young_gauss of the mesh's file" in err
+    assert "dropped young_gauss from the mesh's file" in err

@@ -78,7 +78,7 @@ def test_names_that_come_to_the_same_are_said():
     words = list(doubled(rows))
     assert [line.partition(":")[0] for line in words] == ["row a1", "row --", "row b"]
     assert "sub-a1 is also used by row a-1" in words[0]
-    assert "sub-b_ses-x has a session, sub-b (row b) has none" in words[2]
+    assert "sub-b_ses-x has a session, but sub-b (row b) has none" in words[2]
 
 
 def test_names_that_no_file_can_have_are_refused():

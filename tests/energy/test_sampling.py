@@ -455,7 +455,7 @@ def test_cells_flat_or_inverted_at_the_grid_s_resolution_are_refused(function, h
     """A height of 1e-9 voxel is 0 ticks: positive in the world, flat in the grid."""
     image = Image(np.zeros((4, 4)), np.diag([hand, 1.0, 1.0]))
     flat = Mesh([[0, 0], [2, 0], [1, 1], [1, -1e-9]], [[0, 1, 2], [0, 3, 1]])
-    with pytest.raises(InputError, match=r"1 cells are flat or inverted to within a millionth .* first are \[1\]"):
+    with pytest.raises(InputError, match=r"1 cells are flat or inverted to within a millionth .* such as \[1\]"):
         function(image, flat)
 
 

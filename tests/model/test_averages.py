@@ -203,7 +203,7 @@ def test_a_model_has_moduli_of_nodes():
     )
     assert build_model(mesh, image, young=mapping).node_young is None
     assert build_model(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
-    with pytest.raises(InputError, match=r"bins: moduli that vary within cells cannot.*another average than nodes"):
+    with pytest.raises(InputError, match=r"bins: moduli that vary within cells cannot.*an average other than nodes"):
         build_model(mesh, image, young=mapping, average="nodes", bins=3)
     with pytest.raises(InputError, match=r"average: nodes needs the image's voxels; give the image \(`image`\)"):
         build_model(mesh, young=mapping, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
