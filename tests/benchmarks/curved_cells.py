@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import tetopt
-from tetopt.geometry.quadratic import curved_rule, jacobian_ratios, quadratic, shape_values
+from tetopt.geometry.quadratic import curved_rule, jacobian_ratios, quadratic, shape_slopes, shape_values
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.system.files import checked_output, save_json
@@ -51,15 +51,16 @@ def distance(mesh: tetopt.Mesh, label: np.ndarray, is_curved: bool) -> float:
     cell = sides.cells[shared, 0]
     opposite = np.argmax(sides.of_cell[cell] == shared[:, None], axis=1)
     points, weights = curved_rule(2)
-    off, area = np.empty((len(shared), len(points))), np.empty(len(shared))
+    off, area = np.empty((2, len(shared), len(points)))
     for corner in range(4):
         here = opposite == corner
         places = np.insert(points, corner, 0.0, axis=1)
-        at = np.einsum("qa,mai->mqi", shape_values(places, 2), nodes[cells[cell[here]]])
+        own = nodes[cells[cell[here]]]
+        at = np.einsum("qa,mai->mqi", shape_values(places, 2), own)
         off[here] = np.abs(np.linalg.norm(at, axis=2) - RADIUS)
-        a, b, c = np.moveaxis(mesh.points[sides.nodes[shared[here]]], 1, 0)
-        area[here] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return float(np.average(off @ weights, weights=area))
+        a, b, c = np.delete(np.einsum("qak,mai->kmqi", shape_slopes(places, 2), own), corner, axis=0)
+        area[here] = np.linalg.norm(np.cross(b - a, c - a), axis=2)  # per area of the flat reference, at each point
+    return float(np.average(off, weights=area * weights))
 
 
 def volume(mesh: tetopt.Mesh, label: np.ndarray, is_curved: bool) -> np.ndarray:
