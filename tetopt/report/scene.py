@@ -25,6 +25,8 @@ STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices be
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right, in front and above
 GLASS_OPACITY = 0.6  # of the cells' colours over the image: colours are distinct, and voxels remain visible
 ABOVE_IMAGE = 1e-3  # distance of the cells in a section from the image there, as a fraction of the mesh's extent
+SCENE_ZOOM = 1.05
+KEY_FRACTION = 0.1  # of the picture's width, for a colour bar or legend beside the scene
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
@@ -54,7 +56,7 @@ def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
     """Draw a scene in the plotter's current part, and move the camera to the viewpoint of all scenes."""
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
-    plotter.camera.zoom(1.05)
+    plotter.camera.zoom(SCENE_ZOOM * (1.0 - abs(plotter.camera.GetWindowCenter()[0])))
 
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
@@ -125,6 +127,7 @@ def opened_mesh(shown: Exhibit) -> Draw:
 
     def draw(plotter: pyvista.Plotter) -> None:
         plotter.enable_parallel_projection()  # keeps all of it in the picture
+        plotter.camera.SetWindowCenter(KEY_FRACTION, 0.0)
         plane = {"normal": np.eye(3)[axis], "origin": middle}
         behind, section = grid.extract_surface(algorithm="dataset_surface").clip(**plane), grid.slice(**plane)
         if behind.n_cells:
