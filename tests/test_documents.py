@@ -69,9 +69,8 @@ def test_commands_are_parsed(page, parsers):
 
 def test_a_command_that_is_wrong_is_refused(parsers):
     for wrong in (["--nodes", "many"], ["--no-such-option"]):
-        with pytest.raises(Exception) as refused:
+        with pytest.raises(Exception, match=wrong[0].strip("-")):
             parsers("mesh").make_context("mesh", ["a.nii", "-o", "a.vtu", *wrong])
-        assert wrong[0] in refused.value.format_message()
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)

@@ -86,11 +86,6 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     @wraps(command)
     def called(**values: Any) -> int:
         name_files(values.values())
-        for name, kind, *_ in leaves:
-            if (own := _number_of(kind)) is not None:
-                with suppress(ValueError, TypeError):  # of a text, which is rejected next, or of None
-                    values[name] = own(values[name])
-                values[name] = of_option(name, kind, values[name])
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     leaves = [each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)]
@@ -132,13 +127,25 @@ def _typed(name: str, kind: Any, panel: str | None) -> Any:
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
     names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
-    about["parser"] = str if _number_of(kind) else None  # `of_option` has plainer words for what is none
+    if (number := _number_of(kind)) is not None:  # `of_option` has plainer words than typer for what is none
+        about |= {"parser": str, "callback": _converter(name, kind, number)}
     return Annotated[get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
 
 
 def _number_of(kind: Any) -> type[int] | type[float] | None:
     """Return the type of a number's option; None for other options and parameters."""
     return next((own for own in (int, float) if has_option(kind) and get_args(kind)[0] in (own, own | None)), None)
+
+
+def _converter(name: str, kind: Any, number: Callable[[str], int | float]) -> Callable[[Any], Any]:
+    """Return a function that converts an option's string, or raises InputError for what is no number of its kind."""
+
+    def converted(value: Any) -> Any:
+        with suppress(ValueError, TypeError):  # a string that `of_option` rejects, or None
+            value = number(value)
+        return of_option(name, kind, value)
+
+    return converted
 
 
 def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
