@@ -32,7 +32,7 @@ def test_program(tmp_path, monkeypatch, capsys):
     fraction, shape = re.fullmatch(r"unexplained variance (\S+), mean rho (\S+)", second).groups()
     assert 0.0001 < float(fraction) < 0.01
     assert float(shape) > 0.24
-    n_materials, error = re.fullmatch(r"(\d+) materials, their moduli off by (\S+)% in the mean", third).groups()
+    n_materials, error = re.fullmatch(r"(\d+) materials, their moduli off by (\S+)% on average", third).groups()
     assert 8 <= int(n_materials) <= 16
     assert 0.0 < float(error) < 5.0
     assert "*MATERIAL" in Path("two_spheres.inp").read_text()

@@ -56,7 +56,7 @@ index = image.to_index(mesh.points).T
 back = np.stack([map_coordinates(read[..., axis], index, order=1, mode="nearest") for axis in range(3)], axis=1)
 is_inside = ((index >= 0) & (index.T <= np.array(image.shape) - 1).T).all(axis=0)  # between voxels' centres
 off_mm = np.linalg.norm(back - solution.u, axis=1)[is_inside].mean()
-print(f"displacement: off by {off_mm:.4f} mm in the mean, of up to {np.abs(solution.u).max():.1f} mm")
+print(f"displacement: off by {off_mm:.4f} mm on average, of up to {np.abs(solution.u).max():.1f} mm")
 
 # %%
 # Stress and displacement on the voxels of the middle slice, with contours of the image.

@@ -39,7 +39,7 @@ for name, mesh in (("pytetwild's", before), ("improved", after)):
     print(f"{name:11}: {len(mesh.points)} nodes, unexplained variance {fraction:.4f}, smallest angle {angle}")
 
 # %%
-# With the same boundary nodes and as many inner nodes, a good quarter of the unexplained variance remains.
+# With the same boundary nodes and as many inner nodes, a little over a quarter of the unexplained variance remains.
 
 remaining = tetopt.E_D(image, after) / tetopt.E_D(image, before)
 print(f"{remaining:.2f} times the unexplained variance of pytetwild's mesh")

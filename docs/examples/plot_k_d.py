@@ -31,7 +31,7 @@ for weight, fraction, rho in zip(weights, fractions, shapes, strict=True):
     print(f"k_D = {weight}: {fraction:.4f} of the variance left, mean rho {rho:.3f}")
 
 # %%
-# From 0.2 to the default, the error falls by the fraction printed here, and so does the mean rho. At every weight, all
+# From 0.2 to the default, the error falls by the fraction printed here, and mean rho falls, too. At every weight, all
 # angles stay above the minimum of 12 degrees.
 
 gain = 1.0 - fractions[2] / fractions[0]

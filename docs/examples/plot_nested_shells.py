@@ -3,7 +3,7 @@ Preserve a thin layer of fluid
 ==============================
 
 If the layer of fluid around a brain is torn, brain and skull are coupled and a simulation is wrong. Mesh nested shells
-with sizes from label thickness, and measure the thin shell.
+with sizes from label thickness, and measure the thin layer.
 """
 
 import numpy as np

@@ -31,10 +31,10 @@ mesh = tetopt.mesh_image(tetopt.content(image, mask=mask), nodes=3000).mesh
 
 fidelity = tetopt.mask_fidelity(mask, mesh)
 dice = fidelity.dice
-print(f"Dice {dice:.4f}, boundary off by {fidelity.distance_mean:.2f} voxels in the mean")
+print(f"Dice {dice:.4f}, boundary off by {fidelity.distance_mean:.2f} voxels on average")
 
 # %%
-# The mesh without one octant, cells in the grey of their mean.
+# The mesh without one octant, each cell in the grey of its mean.
 
 grid = mesh.to_pyvista({"mean": tetopt.cell_moments(image, mesh).mean})
 middle = np.array([0.0, -18.0, 10.0])

@@ -2,7 +2,7 @@
 Mesh to a target error
 ======================
 
-Instead of a number of nodes, set the unexplained variance, a fraction of the image's. tetopt finds the number of nodes.
+Instead of a number of nodes, set the unexplained variance (as a fraction). tetopt finds the number of nodes.
 """
 
 import matplotlib.pyplot as plt
