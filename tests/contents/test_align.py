@@ -233,7 +233,7 @@ def test_labels_that_are_none():
         "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     assert said(labels * 0 + 7) == (
-        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit it or use another file"
+        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit them or use others"
     )
 
 

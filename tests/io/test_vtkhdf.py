@@ -219,7 +219,7 @@ BAD = {
     "outside": (outside, '"mean" is stored in another file'),
     "bomb": (empty_bomb, 'damaged: "mean" should have 8796093022208 bytes, but the file stores 0'),
     "lzf": (changed("CellData/mean", np.zeros(192), compression="lzf"), '"mean" has an unsupported compression'),
-    "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" has neither numbers nor texts'),
+    "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" has neither numbers nor strings'),
     "short": (changed("CellData/mean", np.zeros(191)), 'damaged: "mean" has 191 rows, its pieces 192'),
     "three axes": (changed("CellData/mean", np.zeros((192, 2, 2))), "not an array with one or two axes"),
     "counts": (changed("NumberOfCells", [192, 0]), "damaged"),

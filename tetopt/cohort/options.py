@@ -33,7 +33,7 @@ class CohortOptions:
     retry_failed: Annotated[bool, Option(None, "Run only failed subjects; skip out-of-date ones.")] = False
     collect: Annotated[bool, Option(None, "Write the table and page of existing results; run nothing.")] = False
     workers: Annotated[
-        int | None, Option("N", "Maximum number of subjects at a time, or of a `cluster`'s jobs.", least=1)
+        int | None, Option("N", "Maximum number of simultaneous subjects, or of a `cluster`'s jobs.", least=1)
     ] = None
     scheduler: SchedulerOption = None
     cluster: ClusterOption = None

@@ -108,7 +108,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
     if moved.min() == top:
         raise InputError(
-            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit it or use another file"
+            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit them or use others"
         )
     return Image(moved, image.affine)
 

@@ -368,7 +368,7 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     bits = 28 - ceil(log2(reach))
     if bits < 8:
         raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in world mm?"
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are its points in mm?"
         )
     return bits
 

@@ -259,8 +259,8 @@ def _named(path: Path, model: Model) -> Model:
     """
     sets = [*model.sets.facets, *model.sets.cells]
     if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
-        words = f"letters, digits, _ and -, got {plain(odd[0])!r}"
-        raise InputError(f"{path}: expected set names of a letter and up to {MOST_LETTERS - 1} {words}")
+        words = f"letters, digits, _ or -, beginning with a letter, got {plain(odd[0])!r}"
+        raise InputError(f"{path}: expected set names of up to {MOST_LETTERS} {words}")
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
         raise InputError(f"{path}: two sets have the name {twice}; rename one of them")

@@ -167,7 +167,7 @@ def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str
             sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
         else:
             sets.cells[name] = field_data[key].ravel().astype(np.int64)
-    words = "dropped sets that are not ascending cells or facets, or have no unique name"
+    words = "dropped sets with invalid or repeated names, or without ascending cells or facets"
     return sets, (f"{words}: {', '.join(unfit)}",) if unfit else ()
 
 

@@ -115,8 +115,8 @@ def warn_of_result(
             "raised it; `retessellate` accept keeps only those that lower it"
         )
     if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
-        rise = f"{last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "above its initial value 0"
-        warning(f"E_D ended at {rise}: shapes were improved at the expense of E_D; increase `k_D`")
+        rise = f"to {last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "from 0"
+        warning(f"E_D rose {rise}, as shapes were improved at its expense; increase `k_D`")
     n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
         remedy = "reduce `nodes`"

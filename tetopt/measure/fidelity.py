@@ -601,7 +601,7 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     n_voxels = int(moments.n_voxels.sum())
     if n_voxels == 0:
-        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
+        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
     mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
     spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
     n_empty = int((moments.n_voxels == 0).sum())

@@ -49,7 +49,7 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     """
     moments = cell_moments(image, mesh)
     if not moments.n_voxels.any():
-        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
+        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
     owner = cell_of_voxel(image, mesh)

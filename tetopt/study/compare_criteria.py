@@ -59,7 +59,7 @@ def criteria(report: Report) -> list[Criterion]:
     ratios = fem_ratios(report)
     return [
         Criterion("Image", "Image", "E_D, fraction of the image's variance", _at("E_D_fraction"), -1, is_headline=True,
-            blind="where the error is, and whether it matters there: noise within a cell counts like an edge"),
+            blind="where the error is, and whether it matters there; noise within a cell counts like an edge"),
         Criterion("Image", "Image", "voxels outside the mesh", _at("n_missed_voxels"), -1, is_detail=True),
         *_label_criteria(report),
         *_shape_criteria(),
