@@ -83,7 +83,7 @@ class CohortProgress(NamedTuple):
 def run_cohort(
     subjects: str | Path, output: str | Path, *, on: Listener | None = None, **options: Any
 ) -> dict[str, str]:
-    """Mesh many subjects, each as by `run`, as `tetopt cohort` does.
+    """Mesh many subjects, each with `run`, like `tetopt cohort`.
 
     Parameters
     ----------

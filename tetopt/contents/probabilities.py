@@ -38,9 +38,9 @@ BAND_STEPS, BAND_WIDTH = 5, 2.9  # sweeps, and the distance up to which they are
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
-    """Return a tissue's probabilities on the image's voxels, linear where they are on another grid.
+    """Return a tissue's probabilities on the image's voxels, interpolated linearly if their grid differs.
 
-    Whole numbers above 100 and up to 255, as in files of bytes without a scale, are divided by 255, with a warning.
+    Whole numbers with a maximum of 101 to 255, as in unscaled byte files, are divided by 255, with a warning.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class Surface(NamedTuple):
     Parameters
     ----------
     points : (N, 3) float64
-        World mm.
+        World coordinates, mm.
     triangles : (K, 3) int64
         Normals point out of the solid.
     n_parted : int
@@ -99,7 +99,7 @@ def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], cho
     Parameters
     ----------
     points : (N, 3) array of float64
-        Nodes in world mm.
+        Nodes in world coordinates, mm.
     cells : (M, 4) array of int
         Positively oriented tetrahedra of a conforming mesh.
     chosen : (M,) array of bool, or (C,) array of int

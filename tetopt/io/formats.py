@@ -184,20 +184,20 @@ def save_mesh(
 ) -> None:
     """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at all.
 
-    Points are in world mm (RAS+), cells are positively oriented and of order 1 or 2. In VTK's formats each entry of
-    `about` becomes a field-data text, as JSON unless it is a string already. `save_model` also writes sets, materials
-    and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2. In VTK's formats each
+    entry of `about` becomes a string in the field data, as JSON unless it is one already. `save_model` also writes
+    sets, materials and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
     path : str or Path
         Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     cell_data : dict of arrays, optional
         By name, one row per cell.
     about : dict, optional
-        Texts for the file's header, by name.
+        Strings for the file's header, by name.
     point_data : dict of arrays, optional
         By name, one row per mesh point, or per node of order 2.
     order : {1, 2}

@@ -60,7 +60,7 @@ def save_surface(
     path : str or Path
         Its name ends in .stl, .ply, .vtp or .vtk.
     surface : Surface
-        World mm, RAS+.
+        World coordinates in mm, RAS+.
     about : str, optional
         One line of ASCII for the header; STL keeps the first 60 characters, VTP nothing.
     space : {"ras", "lps"}

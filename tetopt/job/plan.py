@@ -152,7 +152,7 @@ def plan(job: JobOptions) -> Plan:
     Raises
     ------
     InputError
-        As `Job`; an output may not be written.
+        As for `Job`; or an output may not be written.
 
     See Also
     --------

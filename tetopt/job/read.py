@@ -38,7 +38,7 @@ def read(job: Job) -> Task:
     Raises
     ------
     InputError
-        As `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
+        As for `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
         support.
 
     See Also

@@ -69,7 +69,7 @@ class Box(NamedTuple):
     shape : tuple of int
         Number of voxels along each axis.
     affine : (n+1, n+1) float64
-        Index -> world mm.
+        From index to world coordinates in mm.
 
     Examples
     --------
