@@ -45,7 +45,7 @@ class Image:
     data : (s_0, ..., s_{n-1}) array of real numbers
         Intensities, n = 2 or 3. Kept as float32 if that is lossless, else as float64; read-only.
     affine : (n+1, n+1) array, optional
-        Homogeneous map from index to world coordinates in mm, by default the identity (1 mm voxels). Float64, read-only.
+        Homogeneous map from index to world coordinates in mm, by default the identity (1 mm voxel). Float64, read-only.
 
     Raises
     ------

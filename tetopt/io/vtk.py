@@ -2,12 +2,12 @@
 
 `tetopt.io.vtkhdf` writes the same contents.
 
-Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or quadratic with straight edges, with
-corners first among the points. Data of cells and points are cell data and point data. Materials are cell data `young`,
-`nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell data
-`young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Strings are field
-data, as UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them. `loads` contains
-loads in text form.
+Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or quadratic with straight
+edges, with corners first among the points. Data of cells and points are cell data and point data. Materials are cell
+data `young`, `nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell
+data `young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Strings are
+field data, as UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them.
+`loads` contains loads in text form.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
 0, for ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data when they
