@@ -379,4 +379,4 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         said = capsys.readouterr()
         assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
-        assert "one of them is missing" in said.out
+        assert "one surface is missing" in said.out

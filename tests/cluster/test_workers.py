@@ -297,7 +297,7 @@ def written(folder, text):
         ("[" * 400, "expected YAML"),
         ("- " * 4000, "expected YAML"),
         ("[" * 600, "at most 500 brackets"),
-        ("#" * 30_000, "at most 20000 letters"),
+        ("#" * 30_000, "at most 20000 characters"),
     ],
 )
 def test_a_file_that_is_no_configuration_is_refused(text, words, tmp_path):

@@ -217,7 +217,7 @@ def test_near_a_point_and_a_plane():
         ("dark", "expected NAME=below:T"),
         ("dark=below:x", "expected 1 number"),
         ("dark=below:-5", "no cell has a mean below -5"),
-        ("1a=below:12", "set name: expected up to 72 letters, .*, beginning with a letter"),
+        ("1a=below:12", "set: expected a name of up to 72 letters, .*, the first a letter"),
         ("LEFT=point:0,0,0:1", r'a set "left" exists already|no boundary facet'),
         ("Boundary=below:12", 'a set "boundary" exists already'),
         ("p=point:0,0:1", "expected 3 numbers"),

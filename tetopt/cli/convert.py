@@ -33,7 +33,7 @@ def convert_command(
     solver: SolverOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix."""
+    """Write a mesh for a solver, with materials, named sets and loads, in the format of OUT's suffix."""
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     numbers.check()

@@ -28,7 +28,7 @@ from tetopt.system.files import results_folder
 
 
 def mesh_command(job: Job, predict: PredictOption = False) -> int:
-    """Mesh an image with nodes where it has detail (or uniformly), optimised, as VTU or for a solver."""
+    """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or for a solver."""
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         if predict:
             return _predict(job, display)

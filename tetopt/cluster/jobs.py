@@ -108,8 +108,8 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     walltime = dask.config.get(f"jobqueue.{kind}.walltime", None)
     words = (
         f"up to {counted(n_jobs, 'job')} of {kind}, each of {counted(job.cores, 'core')} and {memory_words(job.bytes)}"
-        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} at a time of "
-        f"{counted(job.threads, 'thread')}; logs in {folders.logs}; dashboard {dashboard_link(client)}"
+        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} of "
+        f"{counted(job.threads, 'thread')} at a time; logs in {folders.logs}; dashboard {dashboard_link(client)}"
     )
     return Workers(client, jobs.slots, job.threads, job.task_bytes, words, job.bytes / job.processes)
 

@@ -259,7 +259,7 @@ def _named(path: Path, model: Model) -> Model:
     """
     sets = [*model.sets.facets, *model.sets.cells]
     if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
-        words = f"letters, digits, _ or -, beginning with a letter, got {plain(odd[0])!r}"
+        words = f"letters, digits, _ or -, the first a letter, got {plain(odd[0])!r}"
         raise InputError(f"{path}: expected set names of up to {MOST_LETTERS} {words}")
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})

@@ -89,7 +89,7 @@ def save_surface(
         raise InputError(f"{path}: STL cannot store labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
     if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
         raise InputError(
-            f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, beginning with a letter, "
+            f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, "
             f'got "{plain(odd[0])}"; rename them'
         )
     if space == "lps":

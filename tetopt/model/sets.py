@@ -359,7 +359,7 @@ def parse_set(text: str, ndim: int) -> SetRequest:
         raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
     if not SET_NAME.fullmatch(name):
         raise InputError(
-            f'set name: expected up to {MOST_LETTERS} letters, digits, _ or -, beginning with a letter, got "{name}"'
+            f'set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, got "{name}"'
         )
     form, counts = shapes[kind]
     parts = rest.split(":")
