@@ -294,7 +294,7 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
         exit_code(*command, "--mask", tmp_path / f"{name}.nii.gz")
         said = capsys.readouterr().err
         assert f"{name}.nii.gz: resampled" in " ".join(said.split())
-        assert "same scan" not in said
+        assert "that scan" not in said
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):

@@ -385,8 +385,8 @@ def check_intensities(low: float, high: float) -> None:
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
-            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as squares "
-            f"would otherwise overflow or vanish, got {low:g} to {high:g}; rescale them"
+            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as "
+            f"squares would overflow or vanish otherwise, got {low:g} to {high:g}; rescale them"
         )
 
 

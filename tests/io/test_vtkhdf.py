@@ -224,7 +224,7 @@ BAD = {
     "three axes": (changed("CellData/mean", np.zeros((192, 2, 2))), "not an array with one or two axes"),
     "counts": (changed("NumberOfCells", [192, 0]), "damaged"),
     "overflow": (changed("NumberOfCells", [2**62, 2**62, 2**63 - 1]), "damaged"),
-    "minus": (changed("NumberOfCells", [-1, 97, 96]), "damaged: NumberOfCells is not"),
+    "minus": (changed("NumberOfCells", [-1, 97, 96]), "damaged: expected one number in NumberOfCells"),
     "planar": (changed("Points", np.zeros((4, 2))), "do not have three coordinates"),
     "floats": (changed("Types", np.zeros(192)), "not lists of integers"),
     "group": (linked(np.zeros(3), "PointData"), '"PointData" is not a group'),

@@ -187,7 +187,7 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
                 )
     if (name := MEMORY_KEYS.get(kind)) is not None and settings[name] is None:
         raise InputError(
-            f"{path}: {kind}: expected {name}, to request {memory_words(asked_for)} per job "
+            f"{path}: {kind}: expected {name} to request {memory_words(asked_for)} per job "
             "(dask-jobqueue does not do this by itself), got none; see your cluster's manual"
         )
     return Request(cores, n_bytes, processes, threads, need.room_of(n_bytes / processes), _exports(need, threads))
