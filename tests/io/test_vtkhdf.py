@@ -217,7 +217,7 @@ BAD = {
     "whole group": (linked(h5py.ExternalLink("b.h5", "/"), "PointData"), 'expected data for "PointData", got a link'),
     "virtual": (virtual, '"mean" is stored in another file'),
     "outside": (outside, '"mean" is stored in another file'),
-    "bomb": (empty_bomb, 'damaged: "mean" should have 8796093022208 bytes, but the file stores 0'),
+    "bomb": (empty_bomb, 'damaged: "mean" declares 8796093022208 bytes, of which 0 are in'),
     "lzf": (changed("CellData/mean", np.zeros(192), compression="lzf"), '"mean" has an unsupported compression'),
     "compound": (changed("CellData/mean", np.zeros(192, "i4,f8")), '"mean" has neither numbers nor strings'),
     "short": (changed("CellData/mean", np.zeros(191)), 'damaged: "mean" has 191 rows, its pieces 192'),

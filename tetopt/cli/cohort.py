@@ -71,7 +71,7 @@ def _say_estimate(plan: CohortPlan) -> None:
         out.print(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
-    out.print(f"{whole}; on this machine {n_workers} at a time: about {time_words(seconds / n_workers)}")
+    out.print(f"{whole}; about {time_words(seconds / n_workers)} on this machine, {n_workers} at a time")
 
 
 class _CohortDisplay:

@@ -189,7 +189,7 @@ def limit_threads(number: int) -> None:
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:
     """Raise the error of a task, with a one-line message if the user can fix it."""
     what = plain(str(name))
-    limit = memory_words(workers.limit) if workers.limit < float("inf") else "all there is"
+    limit = memory_words(workers.limit) if workers.limit < float("inf") else "all available memory"
     advice = "give workers more memory, or make the tasks smaller"
     if is_lost(error):
         ended_at_limit = {event["worker"] for _, event in _answer(partial(workers.client.get_events, MEMORY_TOPIC))}

@@ -191,7 +191,7 @@ class _Guarded:
         stored = int(each.id.get_storage_size())
         if stored > self.size or n_bytes > stored * (DEFLATE_RATIO if DEFLATE_FILTER in filters else 1):
             raise InputError(
-                f'damaged: "{shown}" should have {n_bytes} bytes, but the file stores {stored} of {self.size}'
+                f'damaged: "{shown}" declares {n_bytes} bytes, of which {stored} are in a file of {self.size}'
             )
         if h5py.check_string_dtype(each.dtype) is not None:
             return np.array(each.asstr(errors="backslashreplace")[()], dtype=np.str_)

@@ -331,7 +331,7 @@ def drop_early(early: Path) -> None:
     try:
         early.unlink(missing_ok=True)
     except OSError as error:
-        note(f"{early}: a copy of the mesh, which cannot be removed: {error.strerror}")
+        note(f"{early}: this copy of the mesh cannot be removed ({error.strerror})")
 
 
 def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:

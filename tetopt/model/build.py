@@ -71,7 +71,7 @@ def build_model(
     average : str
         The average of Young's modulus over voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
         With "gauss" and quadratic cells, moduli vary within a cell in `tetopt.fem.solution.solve`, not in files.
-        Ratios and densities are always the mean.
+        Ratios and densities are always averaged by the mean.
     sets : iterable of str
         Additional sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str

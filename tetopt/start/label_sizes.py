@@ -89,7 +89,7 @@ class LabelLayers(NamedTuple):
     cells_across : float
         Median of thickness over target.
     below : float
-        Fraction of its voxels with fewer cells across than requested; 0 if no number is, as for label 0.
+        Fraction of its voxels with fewer cells across than requested; 0 if none is requested, as for label 0.
 
     Examples
     --------
