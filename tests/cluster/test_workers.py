@@ -273,7 +273,7 @@ def written(folder, text):
         ("jobqueue: {slurm: [1]}", "slurm: expected key-value pairs"),
         ("jobqueue: {slurm: {qeue: long}}", "unknown key qeue; expected one of account, .*, walltime"),
         ("jobqueue: {slurm: {1: long}}", "unknown key 1;"),
-        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected it in quotes, as "12:00:00".*got 43200'),
+        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected a quoted time such as "12:00:00".*got 43200'),
         ("jobqueue: {slurm: {cores: two}}", "cores: expected a whole number above 0, got two"),
         ("jobqueue: {slurm: {cores: 0}}", "cores: expected a whole number above 0"),
         ("jobqueue: {slurm: {processes: true}}", "processes: expected a whole number above 0"),

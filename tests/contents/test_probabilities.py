@@ -225,5 +225,5 @@ def test_tissues_of_another_shape_or_place_are_refused():
 
 def test_a_tissue_that_is_nowhere_the_most_probable_is_named():
     image, tissues, _ = blurred(12)
-    with pytest.warns(UserWarning, match="no cell gets label 3, which is most probable in no voxel"):
+    with pytest.warns(UserWarning, match="no cell gets label 3, which is not the most probable in any voxel"):
         tetopt.content(image, tissues=[*tissues, tetopt.Image(0.1 * tissues[0].data)])

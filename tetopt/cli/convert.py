@@ -21,7 +21,7 @@ def convert_command(
     mesh_path: MeshArgument,
     output: Annotated[Path, Option("OUT", f"The file to write: {', '.join(FORMATS)}.", is_argument=True)],
     image_path: Annotated[
-        Path | None, Option("IMAGE", "Image for means and mappings, instead of the mesh file's means.", "image")
+        Path | None, Option("IMAGE", "Apply mappings to this image, not to the mesh file's means.", "image")
     ] = None,
     mask_path: Annotated[Path | None, Option("MASK", "With `image`: use only voxels in the mask.", "mask")] = None,
     results_path: Annotated[

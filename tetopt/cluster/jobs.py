@@ -367,7 +367,7 @@ def _check_value(what: str, key: str, value: Any, default: Any) -> None:
     """Raise InputError if a value has another type than its key's."""
     if key == "walltime" and not isinstance(value, str):
         raise InputError(
-            f'{what}: expected it in quotes, as "12:00:00" (without, YAML reads seconds), got {_short(value)}'
+            f'{what}: expected a quoted time such as "12:00:00" (unquoted, YAML reads seconds), got {_short(value)}'
         )
     if key in ("cores", "processes") and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise InputError(f"{what}: expected a whole number above 0, got {_short(value)}")

@@ -16,9 +16,7 @@ class CohortOptions:
 
     panel: ClassVar[str] = "Cohort"
     output: Annotated[Path, Option("OUT", "Folder for all outputs; an earlier run there is resumed.", letter="o")]
-    suffix: Annotated[str, Option("WORD", 'BIDS folder: suffix of its images, or with entities "acq-mprage_T1w".')] = (
-        "T1w"
-    )
+    suffix: Annotated[str, Option("WORD", "Suffix of images in a BIDS folder, such as acq-mprage_T1w.")] = "T1w"
     participants: Annotated[
         list[str] | None, Option("LABEL", "Run only this subject. May be repeated.", "participant-label")
     ] = None

@@ -155,7 +155,7 @@ def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Me
     values = np.flatnonzero(np.bincount(largest.ravel(), minlength=len(rows)))
     lost = sorted(set(range(1, len(rows))) - set(values.tolist()))
     if lost:
-        warn(f"tissues: no cell gets label {', '.join(map(str, lost))}, which is most probable in no voxel")
+        warn(f"tissues: no cell gets label {', '.join(map(str, lost))}, which is not the most probable in any voxel")
     second = np.partition(rows, -2, axis=0)[-2]
     first = rows.max(axis=0)
 

@@ -84,7 +84,7 @@ def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
         warning(
             f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the 95th percentile, "
-            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are larger than its details; "
+            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are too large for the details; "
             "allow more nodes"
         )
     if abs(mask.mesh_euler - mask.euler) > EULER_FRACTION * max(abs(mask.euler), EULER_USUAL):
@@ -128,8 +128,8 @@ def warn_of_result(
         )
     if crowded := measured.get("nodes_of_many_labels"):
         warning(
-            f"more than {MOST_MEETING} labels meet at {crowded} nodes, which lie where the first {MOST_MEETING} of "
-            "these meet"
+            f"more than {MOST_MEETING} labels meet at {crowded} nodes; only the first {MOST_MEETING} determine "
+            "where these nodes lie"
         )
 
 

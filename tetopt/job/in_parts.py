@@ -237,7 +237,7 @@ def _check_room(need: Need, room: float) -> None:
     if need.task_bytes > room:
         raise InputError(
             f"a part needs about {memory_words(need.task_bytes)} of memory, and its worker "
-            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than it has; increase `parts`, reduce "
+            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than available; increase `parts`, reduce "
             "`workers`, or give them more memory"
         )
 

@@ -125,7 +125,7 @@ class RegionOptions:
     weights: Annotated[str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")] = None
     smooth_interfaces: Annotated[
         float | None,
-        Option("W", "Smoothing of surfaces between labels, voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
+        Option("W", "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
     ] = None
     free_volumes: Annotated[
         bool, Option(None, "Let labels thinner than cells lose volume, which is preserved by default.")
@@ -308,7 +308,7 @@ class ModelOptions:
         Option(
             "MAPPING",
             'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
-            'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file of such columns.',
+            'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file with such columns.',
         ),
     ] = None
     nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, in the same forms (default {DEFAULT_NU:g}).")] = None

@@ -91,7 +91,7 @@ def dice(labels: Image, truth: Image) -> dict[int, float]:
 def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
     """Number of voxels of each class (rows) and true label (columns)."""
     if labels.shape != truth.shape:
-        raise InputError(f"dice: expected images of one shape, got {labels.shape} and {truth.shape}")
+        raise InputError(f"dice: expected images of the same shape, got {labels.shape} and {truth.shape}")
     for name, image in (("labels", labels), ("truth", truth)):
         check_labels(name, image)
     classes, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
