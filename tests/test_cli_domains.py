@@ -268,7 +268,7 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     assert "square.nii.gz: resampled to the image's grid (linear)" in said
     assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
     assert "half.nii.gz: 48.7% of it lies outside the image; its box covers 50.0% of the image" in said
-    assert "(same shape, different affine); is it of that scan?" in said
+    assert "(same shape, different affine); is it from the same scan?" in said
     moved[:3, 3] = image.to_world([1.5, 0.0, 0.0])
     tetopt.save_image(tmp_path / "near.nii.gz", tetopt.Image(mask.data, moved))
     command = [
@@ -294,7 +294,7 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
         exit_code(*command, "--mask", tmp_path / f"{name}.nii.gz")
         said = capsys.readouterr().err
         assert f"{name}.nii.gz: resampled" in " ".join(said.split())
-        assert "that scan" not in said
+        assert "same scan" not in said
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):

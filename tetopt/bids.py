@@ -20,7 +20,7 @@ USAGE = "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-l
 ABOUT = """
 Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
 subjects, may write to the same OUT at the same time. group: write the table and the page of all subjects in OUT.
-After the level, all options of `tetopt cohort` (python -m tetopt cohort --help) and `tetopt mesh` may follow;
+Options of `tetopt cohort`, including those of `tetopt mesh`, follow the level (python -m tetopt cohort --help);
 their names may contain underscores instead of hyphens.
 """
 

@@ -111,7 +111,7 @@ def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bo
     if is_moved or outside > OUTSIDE_FRACTION:
         warning(
             f"{path}: {outside:.1%} of it lies outside the image; its box covers {in_box(original, moved).mean():.1%} "
-            f"of the image ({'same shape, ' * is_moved}different affine); is it of that scan?"
+            f"of the image ({'same shape, ' * is_moved}different affine); is it from the same scan?"
         )
 
 

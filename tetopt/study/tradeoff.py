@@ -22,7 +22,7 @@ SWEPT_OPTIONS: tuple[SweptOption, ...] = (
      lambda value: {"shape_power": value}),
     ("gradation", {1: 1.0, 2: QUADRATIC_GRADATION}, {1: (0.2, 0.5, 1.0), 2: (0.2, QUADRATIC_GRADATION, 0.9)},
      lambda value: {"sizes": Sizes(gradation=value)}),
-    ("largest edge over a uniform mesh's", {1: COARSEST_RATIO, 2: QUADRATIC_RATIO},
+    ("largest edge, of a uniform mesh's", {1: COARSEST_RATIO, 2: QUADRATIC_RATIO},
      {1: (1.0, 1.15, COARSEST_RATIO, 2.0, 3.0), 2: (0.9, 1.0, QUADRATIC_RATIO, 1.3, 1.6)},
      lambda value: {"sizes": Sizes(coarsest=value)}),
     ("uniform, k_D", dict.fromkeys((1, 2)), dict.fromkeys((1, 2), (0.0, 0.2, 0.5, 0.8)),
