@@ -129,7 +129,7 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
             base = [sys.executable, "-m", "tetopt", "baseline", str(path), "-o", str(folder / "wild.vtu"), "--force"]
             commands["pytetwild"] = [*base, "--nodes", str(nodes), "--labels", str(folder / "labels.nii.gz")]
         if cgal is None:
-            rows["cgal"] = "no program named (--cgal)"
+            rows["cgal"] = "no program given (--cgal)"
         else:
             commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
         seconds: dict[str, list[tuple[float, float]]] = {}
@@ -316,13 +316,13 @@ def show(rows: dict[str, Any]) -> None:
             words = f"{row['wall']:.1f} s, {row['cpu']:.1f} of CPU" if isinstance(row, dict) else row
             print(f"  peers, whole process: {name} {words}")
     for name in ("labelled", "masked_start", "stopped", "head"):
-        row = rows.get(name, {"": "no labels named (--head)"})
+        row = rows.get(name, {"": "no labels given (--head)"})
         print(f"  {name}: {json.dumps({key: value for key, value in row.items() if key != 'run'})}")
     for row in [*rows["graded"], rows["graded_large"]]:
         print(
             f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s, peak "
             f"{row['peak_gb']:.2f} GB; E_D {row['E_D_fraction']:.6f} of the image's variance, mean rho "
-            f"{row['mean_rho']:.4f}, angles from {row['min_dihedral']:.1f}"
+            f"{row['mean_rho']:.4f}, smallest angle {row['min_dihedral']:.1f}"
         )
 
 

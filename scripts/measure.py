@@ -45,7 +45,7 @@ MARKS = ("<!-- from make measured -->", "<!-- end of make measured -->")
 PROGRAMS = {
     "CGAL": "program that meshes labels with CGAL's Mesh_3, see scripts/benchmark.py",
     "CGAL_SIZED": "the same with a sizing field",
-    "CGAL_LABELS": "Python script around it, for `tetopt compare --pipeline`",
+    "CGAL_LABELS": "Python script that runs it, for `tetopt compare --pipeline`",
 }
 PICTURES = {"mni152": ("compared/slices.png", "demo.png")}  # of a measurement: its file, and the name in docs/pictures
 
@@ -244,13 +244,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("data", type=Path, nargs="?", help="folder with the images")
     parser.add_argument("--only", nargs="+", choices=[*MEASUREMENTS], default=[*MEASUREMENTS], help="what to measure")
     parser.add_argument("--pages", action="store_true", help="write the pages from the numbers in measured.json")
-    parser.add_argument("--folder", type=Path, default=ROOT / "measured", help="for the runs' files (%(default)s)")
+    parser.add_argument("--folder", type=Path, default=ROOT / "measured", help="where runs write files (%(default)s)")
     for name, words in PROGRAMS.items():
         parser.add_argument(f"--{name.lower().replace('_', '-')}", type=Path, dest=name, help=words)
     options = parser.parse_args(argv)
     if not options.pages:
         if options.data is None:
-            parser.error("expected the folder with the images, got none; name it, or use --pages")
+            parser.error("expected the folder with the images, got none; give it, or use --pages")
         given = {name: options.data / file for name, file in FILES.items()}
         given |= {name: getattr(options, name) for name in PROGRAMS if getattr(options, name) is not None}
         paths = {name: str(path.resolve()) for name, path in given.items() if path.is_file()}

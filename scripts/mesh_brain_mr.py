@@ -29,7 +29,7 @@ from tetopt.system.files import checked_output, save_json, written_whole
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the workflow; return 0 on success, 2 after a one-line message about an invalid input."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("image", type=Path, help="T1-weighted volume, CSF dark")
+    parser.add_argument("image", type=Path, help="T1-weighted volume, with dark CSF")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the results")
     parser.add_argument("--nodes", type=int, default=10_000, help="target number of nodes (%(default)s)")
     parser.add_argument("--k-d", type=float, default=0.3, help="weight of the image (%(default)s)")

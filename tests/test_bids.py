@@ -69,7 +69,7 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
     assert [line.split("\t")[0] for line in (out / "cohort.tsv").read_text().splitlines()[1:]] == ["sub-01", "sub-02"]
     assert (out / "sub-01" / "sub-01_desc-tetopt_mesh.vtu").exists()
     assert main([str(raw), str(out), "group", "--dry-run"]) == 2
-    assert "--collect: runs nothing" in capsys.readouterr().err
+    assert "--collect runs no subjects" in capsys.readouterr().err
 
 
 def test_help_and_version(capsys):

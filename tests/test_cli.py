@@ -633,7 +633,7 @@ def test_quality_of_a_mesh_elsewhere(run, inputs, tmp_path, capfd):
     _, _, file, _ = run
     save_mesh(tmp_path / "far.vtu", Mesh(file.mesh.points + 1000.0, file.mesh.cells))
     command = ["quality", tmp_path / "far.vtu", "--image", inputs / "sphere.nii.gz"]
-    assert_refused(capfd, command, "no voxel centre lies inside the mesh")
+    assert_refused(capfd, command, "no voxel centre is inside the mesh")
 
 
 def test_quality_of_triangles(inputs, tmp_path, capsys):

@@ -267,8 +267,8 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "square.nii.gz: resampled to the image's grid (linear)" in said
     assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
-    assert "half.nii.gz: 48.7% of it lies outside the image, of which its box covers 50.0%" in said
-    assert "(same shape, other affine); is it from the same scan?" in said
+    assert "half.nii.gz: 48.7% of it lies outside the image; its box covers 50.0% of the image" in said
+    assert "(same shape, different affine); is it from the same scan?" in said
     moved[:3, 3] = image.to_world([1.5, 0.0, 0.0])
     tetopt.save_image(tmp_path / "near.nii.gz", tetopt.Image(mask.data, moved))
     command = [
@@ -379,4 +379,4 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         said = capsys.readouterr()
         assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
         assert "nan voxels" not in said.out
-        assert "one of them is missing" in said.out
+        assert "one surface is missing" in said.out

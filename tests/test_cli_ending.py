@@ -142,7 +142,7 @@ def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, co
     if names == ["stdout"]:
         said = capsys.readouterr().err
         assert said.endswith(
-            "standard output: cannot be written: No space left on device; the printed output is incomplete\n"
+            "standard output cannot be written (No space left on device); the printed output is incomplete\n"
         )
 
 

@@ -167,7 +167,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{mesh}", "{mesh}", "{mesh}"], "expected [IMAGE] MESH, got 3 files"),
         (
             ["{model}", "--compress", "5", "--load", "hold:left"],
-            "--compress and --load: give only one, as in --load compress:5% --load pressure:left:1.5",
+            "--compress and --load: combine them as --load compress:5% --load pressure:left:1.5",
         ),
         (["{model}", "--compress", "51"], "--compress: expected a percentage above 0 and up to 50, got 51"),
         (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: needs an IMAGE, got only a mesh"),
@@ -178,7 +178,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{model}", "--average", "gauss"], "--average: averages over an image's voxels; pass the IMAGE"),
         (["{model}", "--young", "3"], "gravity: the cells have no density; give --density"),
         (["{model}", "--load", "hold:inferor"], "did you mean inferior?"),
-        (["{model}", "--load", "pressure:left:1"], "mesh: it can move freely, as no displacement or spring"),
+        (["{model}", "--load", "pressure:left:1"], "mesh: no displacement or spring constrains it, so it can move"),
         (["{model}", "--load", "move:left:0,free,free"], "can still rotate or slide as a whole"),
         (["{model}", "-o", "{model}", "--force"], "is also an input"),
         (["{model}", "-o", "out.inp"], "out.inp: expected a name ending in .vtu or .vtk"),

@@ -30,7 +30,7 @@ def inputs(tmp_path_factory):
 REFUSED = [
     ("--parts 0", "--parts"),
     ("--parts 2 --uniform", "--parts: needs a graded mesh"),
-    ("--parts 2 --mask ball.nii.gz", "--mask: needs all cells or voxels at once"),
+    ("--parts 2 --mask ball.nii.gz", "--mask: needs all cells or voxels together"),
     ("--parts 2 --edge-size 9", "--edge-size: needs all"),
     ("--parts 2 --order 2", "--order: needs all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),

@@ -19,8 +19,8 @@ LEVELS = ("participant", "group")
 USAGE = "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-label L ...] [options of tetopt cohort]"
 ABOUT = """
 Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
-subjects, may write to the same OUT at once. group: write the table and the page of all subjects in OUT.
-All options of `tetopt cohort` follow the level (python -m tetopt cohort --help), including those of `tetopt mesh`;
+subjects, may write to the same OUT at the same time. group: write the table and the page of all subjects in OUT.
+Options of `tetopt cohort`, including those of `tetopt mesh`, follow the level (python -m tetopt cohort --help);
 their names may contain underscores instead of hyphens.
 """
 
@@ -79,7 +79,7 @@ def _parser() -> _Parser:
     parser.add_argument(
         "--participant-label", nargs="+", default=[], metavar="L", help="subjects, with or without sub-"
     )
-    parser.add_argument("--session-label", nargs="+", default=[], metavar="L", help="with or without ses-")
+    parser.add_argument("--session-label", nargs="+", default=[], metavar="L", help="sessions, with or without ses-")
     for name in ("--skip-bids-validation", "--skip-bids-validator"):
         parser.add_argument(name, action="store_true", help="accepted for compatibility; datasets are never validated")
     parser.add_argument("-v", "--version", action="version", version=f"tetopt {tetopt.__version__}")

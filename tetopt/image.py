@@ -45,7 +45,7 @@ class Image:
     data : (s_0, ..., s_{n-1}) array of real numbers
         Intensities, n = 2 or 3. Kept as float32 if that is lossless, else as float64; read-only.
     affine : (n+1, n+1) array, optional
-        Homogeneous map from index to world mm. By default the identity (1 mm voxels). Kept as float64; read-only.
+        Homogeneous map from index to world coordinates in mm, by default the identity (1 mm voxel). Float64, read-only.
 
     Raises
     ------
@@ -119,7 +119,7 @@ class Image:
 
     @cached_property
     def range(self) -> tuple[float, float]:
-        """The least and greatest intensity, cached like the next three, as each takes a pass over all voxels."""
+        """The smallest and largest intensity, cached like the next three, as each takes a pass over all voxels."""
         return float(self.data.min()), float(self.data.max())
 
     @cached_property
@@ -184,7 +184,7 @@ class Image:
         Returns
         -------
         (..., n) float64
-            World mm, RAS+ in 3-D.
+            World coordinates in mm, RAS+ in 3-D.
 
         Examples
         --------
@@ -201,7 +201,7 @@ class Image:
         Parameters
         ----------
         points : (..., n) array
-            World mm, RAS+ in 3-D.
+            World coordinates in mm, RAS+ in 3-D.
 
         Returns
         -------
@@ -385,8 +385,8 @@ def check_intensities(low: float, high: float) -> None:
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
-            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as their squares "
-            f"would overflow or vanish, got {low:g} to {high:g}; rescale them"
+            f"image data: expected intensities up to {most:g} that differ by at least {least:g}, as "
+            f"squares would overflow or vanish otherwise, got {low:g} to {high:g}; rescale them"
         )
 
 

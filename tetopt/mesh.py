@@ -29,7 +29,7 @@ class Mesh:
     Parameters
     ----------
     points : (N, n) array of float64
-        Node positions in world mm (RAS+ in 3-D). Read-only.
+        Node positions in world coordinates, mm (RAS+ in 3-D). Read-only.
     cells : (M, n+1) array of int64
         Node indices of each cell, positively oriented: the vectors from the first node to the others form a
         right-handed frame. Read-only.
@@ -215,7 +215,7 @@ class Mesh:
         Raises
         ------
         InputError
-            Other kinds of cells, cells of both orders, no cells, flat cells, triangles out of the plane z = 0.
+            Other kinds of cells, cells of both orders, no cells, flat cells, triangles off the plane z = 0.
 
         Examples
         --------

@@ -99,7 +99,7 @@ def _kind(kind: Any, choices: list[str], low: float | None) -> str:
     several = [each for each in get_args(kind) if each is not type(None)]
     if not choices and several:
         return _kind(several[0], choices, low)
-    words = {int: "an integer", float: "a number", str: "a text", Path: "a path", bool: "a switch"}
+    words = {int: "an integer", float: "a number", str: "a string", Path: "a path", bool: "a switch"}
     return (f"one of {', '.join(choices)}" if choices else words[kind]) + ("" if low is None else f", {low:g} or more")
 
 

@@ -126,7 +126,7 @@ def failing(folder, error, name):
         (
             MemoryError(),
             InputError,
-            r"^p.1: needs more memory than a worker's limit of 0.8 GB, including the worker itself \(an alloc",
+            r"^p.1: needs, with its worker, more memory than a worker's limit of 0.8 GB \(an alloc",
         ),
     ],
 )
@@ -149,7 +149,7 @@ def test_more_memory_than_a_worker_may_take_is_refused_where_it_is_asked_for(run
     before = set(crew.client.nthreads())
     with pytest.raises(
         InputError,
-        match=r"^p: needs more memory than a worker's limit of 0.8 GB, including the worker itself \(Unable to",
+        match=r"^p: needs, with its worker, more memory than a worker's limit of 0.8 GB \(Unable to",
     ):
         run(partial(asking, tmp_path), ["p"])
     assert before <= set(crew.client.nthreads())
@@ -169,7 +169,7 @@ def filling(folder, name):
 @pytest.mark.deep
 def test_a_worker_over_its_limit_is_ended_by_its_nanny_and_the_limit_named(run, tmp_path):
     with pytest.raises(
-        InputError, match=r"^p: needs more memory than a worker's limit of 0.8 GB, including the worker itself; give"
+        InputError, match=r"^p: needs, with its worker, more memory than a worker's limit of 0.8 GB; give"
     ):
         run(partial(filling, tmp_path), ["p"], attempts=1)
     assert len(list(tmp_path.iterdir())) == 1

@@ -248,7 +248,7 @@ def test_a_worker_that_runs_several_tasks_in_one_process_is_refused(tmp_path):
 def test_a_worker_without_tetopt_is_refused(tmp_path):
     error = ModuleNotFoundError("No module named 'tetopt'")
     client = SimpleNamespace(nthreads=lambda: {"tcp://a:1": 1}, run=lambda *_, **__: {"tcp://a:1": error})
-    with pytest.raises(InputError, match=r"expected one that has tetopt .* No module named 'tetopt'; install it there"):
+    with pytest.raises(InputError, match=r"expected one with tetopt .* No module named 'tetopt'; install it there"):
         Newcomers(client, Need(1, 0.0, None), tmp_path).slots()
 
 
@@ -270,10 +270,10 @@ def written(folder, text):
         ("jobqueue: {slurm: {}, pbs: {}}", "expected one batch system"),
         ("jobqueue: {slurm: {}}\ndistributed: {}", "expected one batch system"),
         ("jobqueue: {slum: {}}", "expected one of htcondor, lsf, moab, oar, pbs, sge, slurm, got slum"),
-        ("jobqueue: {slurm: [1]}", "slurm: expected keys with their values"),
-        ("jobqueue: {slurm: {qeue: long}}", "expected keys of account, .*, walltime.*, got qeue"),
-        ("jobqueue: {slurm: {1: long}}", "got 1"),
-        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected it in quotes, as "12:00:00".*got 43200'),
+        ("jobqueue: {slurm: [1]}", "slurm: expected key-value pairs"),
+        ("jobqueue: {slurm: {qeue: long}}", "unknown key qeue; expected one of account, .*, walltime"),
+        ("jobqueue: {slurm: {1: long}}", "unknown key 1;"),
+        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected a quoted time such as "12:00:00".*got 43200'),
         ("jobqueue: {slurm: {cores: two}}", "cores: expected a whole number above 0, got two"),
         ("jobqueue: {slurm: {cores: 0}}", "cores: expected a whole number above 0"),
         ("jobqueue: {slurm: {processes: true}}", "processes: expected a whole number above 0"),
@@ -283,9 +283,9 @@ def written(folder, text):
         ("jobqueue: {slurm: {memory: 1e400 GB}}", 'memory: expected an amount of memory such as "8 GB", got 1e400 GB'),
         (
             "jobqueue: {slurm: {job-script-prologue: module load python}}",
-            "job-script-prologue: expected a list of texts",
+            "job-script-prologue: expected a list of strings",
         ),
-        ("jobqueue: {slurm: {scheduler_options: 3}}", "scheduler-options: expected keys with their values"),
+        ("jobqueue: {slurm: {scheduler_options: 3}}", "scheduler-options: expected key-value pairs"),
         ("jobqueue: {slurm: {queue: [long]}}", "queue: expected one value"),
         ("jobqueue: {slurm: {queue: &a long, account: *a}}", "without aliases"),
         ("a: &a {x: 1}\nb: {<<: [*a, *a]}", "without aliases"),  # in one another they take all CPU time
@@ -297,7 +297,7 @@ def written(folder, text):
         ("[" * 400, "expected YAML"),
         ("- " * 4000, "expected YAML"),
         ("[" * 600, "at most 500 brackets"),
-        ("#" * 30_000, "at most 20000 letters"),
+        ("#" * 30_000, "at most 20000 characters"),
     ],
 )
 def test_a_file_that_is_no_configuration_is_refused(text, words, tmp_path):

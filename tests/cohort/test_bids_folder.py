@@ -136,7 +136,7 @@ def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="expected JSON"):
         bids_subjects(tmp_path)
     file.write_text("[]")
-    with pytest.raises(InputError, match="a table in JSON, got list"):
+    with pytest.raises(InputError, match="a JSON object, got list"):
         bids_subjects(tmp_path)
     file.write_text("{}")
     with pytest.raises(InputError, match=r"no subject has an image _T1w\.nii\.gz; use `suffix`"):

@@ -61,7 +61,7 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         column["name"] for column in data_of(text)["columns"]
     }
     assert "Common to all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(r"Meshing took [\d.]+ min of computing, excluding start-up and pictures[.]", text)
+    assert re.search(r"Meshing took [\d.]+ min of computing time, excluding start-up and pictures[.]", text)
 
 
 def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):

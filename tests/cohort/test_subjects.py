@@ -84,7 +84,7 @@ def test_names_that_come_to_the_same_are_said():
 def test_names_that_no_file_can_have_are_refused():
     assert list(doubled([subject("n" * 196)])) == []
     (line,) = doubled([subject("n" * 100, "s" * 100)])
-    assert "has 209 letters" in line
+    assert "has 209 characters" in line
 
 
 def test_a_table_that_was_written_reads_the_same(tmp_path):

@@ -195,7 +195,7 @@ def test_masks_that_are_none():
         "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); select one volume or slice"
     )
     labels = np.arange(24).reshape(4, 3, 2)
-    what = "m.nii: expected a mask, 0 and one other value or fractions from 0 to 1, got "
+    what = "m.nii: expected a mask (0 and one other value, or fractions from 0 to 1), got "
     todo = "; convert it to 0 and 1 first"
     assert said(labels) == what + "24 values from 0 to 23 (0, 1, 2, 3, 4, ...)" + todo
     assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
@@ -233,7 +233,7 @@ def test_labels_that_are_none():
         "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     assert said(labels * 0 + 7) == (
-        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit it or use another file"
+        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit them or use others"
     )
 
 
@@ -251,7 +251,7 @@ def test_a_contrast_covers_half_of_the_image():
     aligned = resample_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
     np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
     assert message(resample_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
-        "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
+        "t2: expected it to cover at least half of the image's voxels, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
         "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     assert message(resample_contrast, "t2", tetopt.Image(other[0]), image) == (

@@ -122,7 +122,7 @@ def test_sums_above_1_are_told_and_divided():
 
 def test_bytes_are_taken_as_such():
     image = tetopt.Image(np.zeros((2, 2)))
-    with pytest.warns(UserWarning, match="grey: whole numbers up to 204, read as probabilities times 255"):
+    with pytest.warns(UserWarning, match="grey: whole numbers up to 204 are read as probabilities times 255"):
         moved = tetopt.resample_tissue(tetopt.Image(np.array([[0.0, 51.0], [204.0, 3.0]])), image, "grey")
     np.testing.assert_allclose(moved.data, [[0.0, 0.2], [0.8, 3.0 / 255.0]], rtol=1e-6)
 
@@ -225,5 +225,5 @@ def test_tissues_of_another_shape_or_place_are_refused():
 
 def test_a_tissue_that_is_nowhere_the_most_probable_is_named():
     image, tissues, _ = blurred(12)
-    with pytest.warns(UserWarning, match="never the most probable: number 3"):
+    with pytest.warns(UserWarning, match="no cell gets label 3, which is not the most probable in any voxel"):
         tetopt.content(image, tissues=[*tissues, tetopt.Image(0.1 * tissues[0].data)])

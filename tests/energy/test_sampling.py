@@ -464,7 +464,7 @@ def test_a_mesh_in_other_units_is_refused(function):
     image = Image(np.zeros((4, 4, 4)))
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
     assert function(image, Mesh(mesh.points + 2.0**20 - 8, mesh.cells)) is not None
-    with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* in world mm\?"):
+    with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* points in mm\?"):
         function(image, Mesh(mesh.points + 2.0**21, mesh.cells))
 
 

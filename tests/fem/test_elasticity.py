@@ -515,7 +515,7 @@ def test_the_loose_one_among_many_is_named(n_triangles):
     with pytest.raises(InputError) as error:
         check_held(points, cells, is_prescribed)
     assert str(error.value) == (
-        "mesh: 1 cells around cell 7 (node 21) can still rotate or slide as a whole: too few nodes connect them; "
+        "mesh: 1 cells around cell 7 (node 21) can still rotate or slide as a whole, as too few nodes connect them; "
         "fix more nodes or keep the largest facet-connected set"
     )
 

@@ -498,8 +498,8 @@ def test_what_cannot_be_solved():
     assert refused(other) == 'load: expected displacement, pressure, traction, spring or gravity, got "torque"'
     adrift = model._replace(loads=model.loads[1:])
     assert refused(adrift) == (
-        "mesh: it can move freely, as no displacement or spring constrains it; fix or support at least one set, "
-        "as hold:SET and spring:SET:K do"
+        "mesh: no displacement or spring constrains it, so it can move freely; fix or support at least one set, "
+        "for example with hold:SET or spring:SET:K"
     )
     sliding = model_with(mesh, sets, ["move:inferior:free,free,0", "pressure:superior:1"], 1, young=2.0)
     assert refused(sliding).startswith(f"mesh: {len(mesh.cells)} cells around cell 0 ")

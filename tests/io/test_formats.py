@@ -194,7 +194,7 @@ def test_names_of_any_length(suffix, tmp_path):
 def test_sets_that_some_format_cannot_name_are_refused(name, suffix, tmp_path):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets | {name: model.sets.facets["boundary"]}, model.sets.cells)
-    with pytest.raises(InputError, match=r"expected set names of a letter and up to 71 letters") as error:
+    with pytest.raises(InputError, match=r"expected set names of up to 72 letters") as error:
         save_model(tmp_path / f"a{suffix}", model._replace(sets=sets))
     assert plain(str(error.value)) == str(error.value)
     assert list(tmp_path.iterdir()) == []

@@ -200,7 +200,7 @@ def test_the_bombs_are_else_good(tmp_path, name, raw):
 
 def test_cells_of_another_number_of_nodes(tmp_path):
     (tmp_path / "a.vtk").write_bytes(legacy(numbers=4).replace(b"4 0 1 2 3", b"3 0 1 2"))
-    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, but some have another number")
+    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, but some have a different number")
     (tmp_path / "a.vtk").write_bytes(legacy().replace(b"\n10\n", b"\n99\n"))
     refused(load_mesh, tmp_path / "a.vtk", "no cells of type 99|damaged")
 

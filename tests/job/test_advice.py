@@ -84,7 +84,7 @@ def ended(E=0.5, E_D=0.5):
         (ended(), "graded", 100, {}, ""),
         (ended(), "graded", 120, {}, "100 nodes instead of 120: use more iterations"),
         (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
-        (ended(E_D=1.2), "start", None, {}, "E_D ended at 1.200 times its initial value"),
+        (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),
         (ended(), "graded", None, {"cells_without_voxel": 1}, "1 of 1 cells contain no voxel centre"),
         (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),

@@ -38,7 +38,7 @@ def test_values_are_brought_to_the_kinds_of_their_options():
     ({"mask": "a\0b"}, "`mask`: expected a path, got"),
     ({"lattice": "x"}, "`lattice`: expected bcc or five-tet or criss-cross or octree, got 'x'"),
     ({"force": "yes"}, "`force`: expected True or False, got 'yes'"),
-    ({"units": None}, "`units`: expected a text, got None"),
+    ({"units": None}, "`units`: expected a string, got None"),
     ({"nodes": 30, "spacing": 2.0}, "`nodes` and `spacing`: give only one of them"),
     ({"mask": "m.nii", "background": 3}, "`mask` and `background`: give only one of them"),
     ({"output": "a.docx"}, "a.docx: unknown suffix"),

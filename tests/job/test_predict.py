@@ -66,7 +66,7 @@ def test_what_a_run_refuses_its_prediction_does(image_path, tmp_path, capsys):
     capsys.readouterr()
     limited = mesh_words(image_path, tmp_path, "--force", "--nodes", "60", "--edge-max", "3")
     assert exit_code(*limited) == exit_code(*limited, "--predict") == 2
-    run, prediction = capsys.readouterr().err.split("they need at least")[1:]
+    run, prediction = capsys.readouterr().err.split("which need at least")[1:]
     assert run.split(";")[0] == prediction.split(";")[0]
 
 

@@ -108,7 +108,7 @@ def test_dice_by_hand():
 
 def test_dice_bad_input():
     one = tetopt.Image(np.zeros((2, 2)))
-    with pytest.raises(tetopt.InputError, match=r"one shape, got \(2, 2\) and \(3, 2\)"):
+    with pytest.raises(tetopt.InputError, match=r"the same shape, got \(2, 2\) and \(3, 2\)"):
         dice(one, tetopt.Image(np.zeros((3, 2))))
     with pytest.raises(tetopt.InputError, match="truth: labels must be whole numbers"):
         dice(one, tetopt.Image(np.full((2, 2), 0.5)))

@@ -85,5 +85,5 @@ def test_mapping_is_a_table_or_a_formula():
 
 @pytest.mark.parametrize("text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001])
 def test_formulas_without_end(text):
-    with pytest.raises(tetopt.InputError, match="expected at most 10000 letters"):
+    with pytest.raises(tetopt.InputError, match="expected at most 10000 characters"):
         parse_formula(text)

@@ -217,9 +217,9 @@ def test_near_a_point_and_a_plane():
         ("dark", "expected NAME=below:T"),
         ("dark=below:x", "expected 1 number"),
         ("dark=below:-5", "no cell has a mean below -5"),
-        ("1a=below:12", "expected a name of a letter"),
-        ("LEFT=point:0,0,0:1", r'a set "left" exists already|no boundary facet'),
-        ("Boundary=below:12", 'a set "boundary" exists already'),
+        ("1a=below:12", "set: expected a name of up to 72 letters, .*, the first a letter"),
+        ("LEFT=point:0,0,0:1", r'a set "left" already exists|no boundary facet'),
+        ("Boundary=below:12", 'a set "boundary" already exists'),
         ("p=point:0,0:1", "expected 3 numbers"),
         ("p=point:0,0,0", "expected point:X,Y,Z:D"),
         ("p=plane:0,0,0:1", "expected plane:X,Y,Z:NX,NY,NZ:D"),
@@ -235,7 +235,7 @@ def test_words_that_are_refused(text, match):
 
 def test_a_surface_takes_its_name_too():
     model = sample_model(3)
-    with pytest.raises(InputError, match='"dark_surface" exists already'):
+    with pytest.raises(InputError, match='"dark_surface" already exists'):
         with_requested(
             model.mesh,
             Sets({"dark_surface": boundary_rows(model.mesh)}, {}),

@@ -47,7 +47,7 @@ def test_members_by_name():
         ("white=2=3", 'got "white=2=3"'),
         ("white=2; white=3", "a different name for each group, got white twice"),
         ("white=2; 1:grey=3", "a different label for each group, got 1 twice"),
-        ("40000:white=2; rest=*", f"numbers of groups up to {LARGEST_LABEL}"),
+        ("40000:white=2; rest=*", f"group numbers up to {LARGEST_LABEL}"),
         ("white=*; grey=*", r"expected \* in at most one group"),
         ("white=2,41; grey=3,40-42; rest=*", "label 41 is in two groups, white and grey"),
         ("white=41-2; rest=*", "increasing range up to 32767, got 41-2"),

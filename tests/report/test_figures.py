@@ -580,7 +580,7 @@ def test_titles_say_how_many_nodes_and_how_good(monkeypatch, tmp_path, run):
     image, initial, result = run
     flat = Image(np.full(image.shape, 7.0))
     for shown, made, words in (
-        (image, result, f"{result.history[-1].E_D / result.history[0].E_D:.3f} of its E_D"),
+        (image, result, f"{result.history[-1].E_D / result.history[0].E_D:.3f} of the initial E_D"),
         (flat, MeshingResult(initial, history(0.0), "iterations", initial), "constant image"),
     ):
         save_run_figures([tmp_path / k for k in "abc"], shown, initial, made)

@@ -295,7 +295,7 @@ def test_the_coarsest_octree_is_counted_without_blocks(monkeypatch, sizes):
     monkeypatch.setattr(octree, "_blocks_by_depth", None)
     assert least_nodes(plain(image), 60, sizes) == count > 100
     assert 0.5 * within < least_nodes(content, 60, sizes) < 1.1 * within
-    with pytest.raises(tetopt.InputError, match=f"they need at least .*; use {count}, or allow longer edges"):
+    with pytest.raises(tetopt.InputError, match=f"which need at least .*; use {count}, or allow longer edges"):
         octree_mesh(image, 60, sizes)
 
 

@@ -241,11 +241,11 @@ def test_resume_keeps_what_is_done(run, head, undrawn, tmp_path, capsys):
     (out / "runs" / "bcc-400-1.json").unlink()
     capsys.readouterr()
     assert main(again) == 0
-    assert capsys.readouterr().err.count("finished before") == 7
+    assert capsys.readouterr().err.count("already finished") == 7
     after = json.loads((out / "report.json").read_text())
     assert [p["median"]["E_D"] for p in after["pipelines"]] == [p["median"]["E_D"] for p in before["pipelines"]]
     assert main([*again, "--k-d", "0.3", "--pipelines", "bcc", "--curve", ""]) == 0
-    assert "finished before" not in capsys.readouterr().err
+    assert "already finished" not in capsys.readouterr().err
     assert main([word for word in again if word != "--resume"]) == 2
     assert "already exists" in capsys.readouterr().err
     kept = (out / "report.json").read_bytes()

@@ -55,7 +55,7 @@ def test_slices_hold_means_and_losses(small, n_meshes):
 
 def test_slices_refuse_missing_means(small):
     image, both = small
-    with pytest.raises(InputError, match="one array of means for each mesh"):
+    with pytest.raises(InputError, match="got 0 arrays of means for 2 meshes; give one for each"):
         slices_figure(image, both, [])
 
 

@@ -228,7 +228,7 @@ def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     a, mesh = str(tmp_path / "a.nii"), str(tmp_path / "m.vtu")
     assert main(["mesh", a, "-o", mesh, *box, "--nodes", "80", "--iterations", "1"]) == 0
     assert main(["fem", a, mesh]) == 2
-    assert "same image, crop and slice?" in capsys.readouterr().err
+    assert "the same image, crop and slice?" in capsys.readouterr().err
     assert main(["fem", a, mesh, *box, "--compress", "2", "-o", str(tmp_path / "p.vtu")]) == 0
     grid = meshio.read(tmp_path / "p.vtu")
     u, z = grid.point_data["displacement"], grid.points[:, 2]

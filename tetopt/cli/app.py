@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice does not concern the user
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)
     if reason := settle_streams():
-        show_error(f"standard output: cannot be written: {reason}; the printed output is incomplete")
+        show_error(f"standard output cannot be written ({reason}); the printed output is incomplete")
         code = code or 2
     return code
 

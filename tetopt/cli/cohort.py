@@ -61,7 +61,7 @@ def _say_estimate(plan: CohortPlan) -> None:
     to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
     for entry in to_run:
         if (one := estimate.get(entry.key)) is None:
-            out.print(escape(f"{entry.key}: size unknown, as its image cannot be read"))
+            out.print(escape(f"{entry.key}: size unknown because its image cannot be read"))
         else:
             out.print(escape(f"{entry.key}: {one.seconds:.0f} s on one thread, {memory_words(one.peak_bytes)}"))
     seconds = sum(one.seconds for one in estimate.values())
@@ -71,7 +71,7 @@ def _say_estimate(plan: CohortPlan) -> None:
         out.print(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
-    out.print(f"{whole}; on this machine {n_workers} at a time: about {time_words(seconds / n_workers)}")
+    out.print(f"{whole}; about {time_words(seconds / n_workers)} on this machine, {n_workers} at a time")
 
 
 class _CohortDisplay:

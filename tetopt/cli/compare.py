@@ -25,14 +25,14 @@ def paper_command(
     output: ResultsOption,
     image: Annotated[Path | None, Option("T1", "Brain MR volume (default: nilearn's MNI152 T1).")] = None,
     labels: Annotated[Path | None, Option("LABELS", "Tissue labels of IMAGE, for Dice.")] = None,
-    seeds: Annotated[int, Option("N", "Random meshes for Fig. 1.")] = 200,
+    seeds: Annotated[int, Option("N", "Number of random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
     """Reproduce the paper's figures and table: paper.json, pictures, and a page that compares the numbers."""
     from tetopt.study.paper_files import reproduce
 
     page, seconds = reproduce(output, image, labels, seeds, force)
-    out.print(escape(f"{page}: the paper's numbers next to tetopt's, in {seconds:.0f} s"))
+    out.print(escape(f"{page}: the paper's numbers next to tetopt's; {seconds:.0f} s"))
     return 0
 
 
@@ -83,7 +83,7 @@ def _print_headline(first: Headline) -> None:
     for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
         if claims:
             table = Table(title=title, box=None, title_justify="left")
-            for heading in ("", "tetopt", "best peer", "", "tetopt over it", "", "  "):
+            for heading in ("", "tetopt", "best peer", "", "tetopt relative to it", "", "  "):
                 table.add_column(heading, justify="left" if not heading.strip() else "right")
             for each in claims:
                 numbers = (number_text(each.ours.value), number_text(each.other.value))

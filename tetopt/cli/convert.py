@@ -21,7 +21,7 @@ def convert_command(
     mesh_path: MeshArgument,
     output: Annotated[Path, Option("OUT", f"The file to write: {', '.join(FORMATS)}.", is_argument=True)],
     image_path: Annotated[
-        Path | None, Option("IMAGE", "Use this image's means and mappings, not the mesh file's.", "image")
+        Path | None, Option("IMAGE", "Apply mappings to this image, not to the mesh file's means.", "image")
     ] = None,
     mask_path: Annotated[Path | None, Option("MASK", "With `image`: use only voxels in the mask.", "mask")] = None,
     results_path: Annotated[
@@ -33,7 +33,7 @@ def convert_command(
     solver: SolverOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix."""
+    """Write a mesh for a solver, with materials, named sets and loads, in the format of OUT's suffix."""
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     numbers.check()

@@ -28,19 +28,19 @@ def fem_command(
         list[Path],
         Option(
             "[IMAGE] MESH",
-            "VTU, VTK or MSH file. IMAGE, whose intensities mappings use, is optional if this has moduli and loads.",
+            "VTU, VTK or MSH file. IMAGE, to which mappings apply, is optional if the file has moduli and loads.",
             is_argument=True,
         ),
     ],
     compress: Annotated[
         float | None,
-        Option("PERCENT", f"Push the bottom in by this much, top fixed (default with IMAGE {PAPER_PERCENT:g})."),
+        Option("PERCENT", f"Push the bottom in by PERCENT, top fixed (default {PAPER_PERCENT:g} with an IMAGE)."),
     ] = None,
     conditioning: Annotated[
         bool | None,
         Option(
             None,
-            "Condition number of the first step's stiffness (default: for the compression of an IMAGE's box).",
+            "Condition number of the first step's stiffness (default: only when compressing an IMAGE's box).",
             "conditioning/--no-conditioning",
         ),
     ] = None,

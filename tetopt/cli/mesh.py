@@ -28,7 +28,7 @@ from tetopt.system.files import results_folder
 
 
 def mesh_command(job: Job, predict: PredictOption = False) -> int:
-    """Mesh an image with nodes where it has detail (or uniformly), optimised, as VTU or for a solver."""
+    """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or for a solver."""
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         if predict:
             return _predict(job, display)
@@ -74,7 +74,7 @@ def _print_comparison(result: Result, n_empty: int) -> None:
     first, last = result.optimized.history[0], result.optimized.history[-1]
     table = new_table("", result.task.start_name, "optimised")
     is_tense = result.optimized.labels is not None  # as soon as cells have labels
-    table.add_row("E, combined, + tension at the end" if is_tense else "E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
+    table.add_row("E, combined (last with tension)" if is_tense else "E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
     table.add_row("E_G, relative to initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, relative to initial", "1.0000", f"{last.E_D / first.E_D:.4f}")

@@ -27,7 +27,7 @@ def print_prediction(task: Task) -> None:
     n_bytes, fraction = prediction.peak_bytes, model.bytes_fraction
     out.print(f"{memory_words(n_bytes)} of memory at peak, in nine of ten cases within {fraction:.0%}")
     if task.plan.job.target_error is not None:
-        out.print(f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many the error needs")
+        out.print(f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many are needed")
     free = available_bytes()
     if n_bytes > free:
         show_warning(f"only {memory_words(free)} of memory is free, less than this run needs; reduce --nodes or crop")

@@ -26,7 +26,7 @@ def quality_command(
         bool,
         Option(
             None,
-            "Check for a valid mesh with a manifold boundary and, with the `image` of its run, that it fills the box "
+            "Check that the mesh is valid with a manifold boundary and, with the `image` of its run, fills the box "
             "and meets the run's requirements; exit 1 if not.",
         ),
     ] = False,

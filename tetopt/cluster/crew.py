@@ -139,7 +139,7 @@ class Newcomers:
         ours = About.of(self.probe)
         if not isinstance(about, About):
             raise InputError(
-                f"worker {address}: expected one that has tetopt {ours.version}, got "
+                f"worker {address}: expected one with tetopt {ours.version}, got "
                 f"{type(about).__name__}: {str(about).splitlines()[0] if str(about) else ''}; install it there"
             )
         for name, here, there in (
@@ -149,7 +149,7 @@ class Newcomers:
             if here != there:
                 raise InputError(
                     f"worker {address} on {about.host}: expected {name} {here} as here, got {there}; "
-                    "install the same there"
+                    "install the same version there"
                 )
         if about.probe != self.token:
             raise InputError(

@@ -108,8 +108,8 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     walltime = dask.config.get(f"jobqueue.{kind}.walltime", None)
     words = (
         f"up to {counted(n_jobs, 'job')} of {kind}, each of {counted(job.cores, 'core')} and {memory_words(job.bytes)}"
-        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} at a time of "
-        f"{counted(job.threads, 'thread')}; logs in {folders.logs}; dashboard {dashboard_link(client)}"
+        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} of "
+        f"{counted(job.threads, 'thread')} at a time; logs in {folders.logs}; dashboard {dashboard_link(client)}"
     )
     return Workers(client, jobs.slots, job.threads, job.task_bytes, words, job.bytes / job.processes)
 
@@ -145,14 +145,14 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
     if kind not in kinds:
         raise InputError(f"{path}: jobqueue: expected one of {', '.join(sorted(kinds))}, got {_short(kind)}")
     if not isinstance(raw, dict | None):
-        raise InputError(f"{path}: {kind}: expected keys with their values, got {_short(raw)}")
+        raise InputError(f"{path}: {kind}: expected key-value pairs, got {_short(raw)}")
     defaults = _defaults()[kind]
     keys = sorted(set(defaults) - OLD_KEYS)
     settings: dict[str, Any] = {}
     for name, value in (raw or {}).items():
         key = name.replace("_", "-") if isinstance(name, str) else name
         if key not in keys:
-            raise InputError(f"{path}: {kind}: expected keys of {', '.join(keys)}, got {_short(name)}")
+            raise InputError(f"{path}: {kind}: unknown key {_short(name)}; expected one of {', '.join(keys)}")
         _check_value(f"{path}: {kind}: {key}", key, value, defaults[key])
         settings[key] = value
     return kind, settings
@@ -183,12 +183,12 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
             if n_bytes < least:
                 raise InputError(
                     f"{path}: {kind}: {key}: expected at least {memory_words(least)} for {processes} of the largest "
-                    f"tasks at a time, got {settings[key]}; leave it out, and jobs request what tasks need"
+                    f"tasks at a time, got {settings[key]}; omit it to let jobs request what tasks need"
                 )
     if (name := MEMORY_KEYS.get(kind)) is not None and settings[name] is None:
         raise InputError(
-            f"{path}: {kind}: expected {name} to request {memory_words(asked_for)} per job, "
-            "which dask-jobqueue does not do by itself, got none; see your cluster's manual"
+            f"{path}: {kind}: expected {name} to request {memory_words(asked_for)} per job "
+            "(dask-jobqueue does not do this by itself), got none; see your cluster's manual"
         )
     return Request(cores, n_bytes, processes, threads, need.room_of(n_bytes / processes), _exports(need, threads))
 
@@ -346,7 +346,7 @@ def _yaml_of(path: Path) -> Any:
 
     text = text_of(path, "file of dask-jobqueue's configuration")
     for most, count, noun in (
-        (YAML_LETTERS, len(text), "letters"),
+        (YAML_LETTERS, len(text), "characters"),
         (YAML_BRACKETS, text.count("[") + text.count("{"), "brackets"),
     ):
         if count > most:
@@ -354,7 +354,7 @@ def _yaml_of(path: Path) -> Any:
     try:
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
             raise InputError(
-                f"{path}: expected YAML without aliases (*name), which may expand without limit; write it out"
+                f"{path}: expected YAML without aliases (*name), which may expand without limit; write out their values"
             )
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -367,16 +367,16 @@ def _check_value(what: str, key: str, value: Any, default: Any) -> None:
     """Raise InputError if a value has another type than its key's."""
     if key == "walltime" and not isinstance(value, str):
         raise InputError(
-            f'{what}: expected it in quotes, as "12:00:00" (without, YAML reads seconds), got {_short(value)}'
+            f'{what}: expected a quoted time such as "12:00:00" (unquoted, YAML reads seconds), got {_short(value)}'
         )
     if key in ("cores", "processes") and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise InputError(f"{what}: expected a whole number above 0, got {_short(value)}")
     if key == "memory":
         _bytes_of(what, value)
     if isinstance(default, list) and not (isinstance(value, list) and all(isinstance(item, str) for item in value)):
-        raise InputError(f"{what}: expected a list of texts, got {_short(value)}")
+        raise InputError(f"{what}: expected a list of strings, got {_short(value)}")
     if isinstance(default, dict) and not isinstance(value, dict):
-        raise InputError(f"{what}: expected keys with their values, got {_short(value)}")
+        raise InputError(f"{what}: expected key-value pairs, got {_short(value)}")
     if not isinstance(default, list | dict) and isinstance(value, list | dict):
         raise InputError(f"{what}: expected one value, got {_short(value)}")
 

@@ -189,21 +189,20 @@ def limit_threads(number: int) -> None:
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:
     """Raise the error of a task, with a one-line message if the user can fix it."""
     what = plain(str(name))
-    limit = memory_words(workers.limit) if workers.limit < float("inf") else "all there is"
+    limit = memory_words(workers.limit) if workers.limit < float("inf") else "all available memory"
     advice = "give workers more memory, or make the tasks smaller"
     if is_lost(error):
         ended_at_limit = {event["worker"] for _, event in _answer(partial(workers.client.get_events, MEMORY_TOPIC))}
         last = getattr(getattr(error, "last_worker", None), "address", None)
         if last in ended_at_limit:
             raise InputError(
-                f"{what}: needs more memory than a worker's limit of {limit}, including the worker itself; {advice}"
+                f"{what}: needs, with its worker, more memory than a worker's limit of {limit}; {advice}"
             ) from error
         raise InputError(f"{what}: {lost_words(attempts)}; {advice}") from error
     if isinstance(error, MemoryError):
         reason = plain(" ".join(str(error).split())) or "an allocation failed"
         raise InputError(
-            f"{what}: needs more memory than a worker's limit of {limit}, including the worker itself ({reason}); "
-            f"{advice}"
+            f"{what}: needs, with its worker, more memory than a worker's limit of {limit} ({reason}); {advice}"
         ) from error
     if isinstance(error, OSError) and error.errno in FULL_NUMBERS:
         raise InputError(f"{what}: {plain(str(error))}; free some space, and run this again") from error

@@ -204,8 +204,8 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
         raise InputError(f"`scheduler`: {address} has no workers; start some with: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
     n_bytes = min(map(newcomers.room_of, newcomers.known.values()), default=float("inf"))
-    words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
-    words += counted(threads, "thread")
+    words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} of "
+    words += f"{counted(threads, 'thread')} at a time"
     limit = min((about.n_bytes for about in newcomers.known.values()), default=float("inf"))
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}", limit)
 

@@ -116,7 +116,7 @@ def _check_dataset(folder: Path) -> None:
     except ValueError as error:
         raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; correct the file") from error
     if not isinstance(table, dict):
-        raise InputError(f"{_shown(file)}: expected a table in JSON, got {type(table).__name__}")
+        raise InputError(f"{_shown(file)}: expected a JSON object, got {type(table).__name__}")
 
 
 def _kind(suffix: str) -> Name:

@@ -83,7 +83,7 @@ class CohortProgress(NamedTuple):
 def run_cohort(
     subjects: str | Path, output: str | Path, *, on: Listener | None = None, **options: Any
 ) -> dict[str, str]:
-    """Mesh many subjects, each as by `run`, as `tetopt cohort` does.
+    """Mesh many subjects, each with `run`, like `tetopt cohort`.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     if options.threads is not None and options.threads < 1:
         raise InputError(f"`threads`: expected 1 or more, got {options.threads}")
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
-        raise InputError("`collect`: runs nothing; leave it out, or `write_table`, `dry_run` and `retry_failed`")
+        raise InputError("`collect` runs no subjects; omit it, or `write_table`, `dry_run` and `retry_failed`")
     if cohort.write_table is not None:
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)

@@ -82,7 +82,7 @@ def check_out(out: Path) -> None:
     if not out.is_dir():
         raise InputError(f"{out}: expected a folder for the cohort, got a file")
     if any(out.iterdir()) and not is_cohort(out):
-        raise InputError(f"{out} is not a cohort folder; choose an empty one, or one of a cohort")
+        raise InputError(f"{out} is not a cohort folder; choose an empty folder, or that of a cohort")
     for name in OWN_NAMES:
         if (wrong := not_our_file(out / name)) is not None:
             raise InputError(wrong)

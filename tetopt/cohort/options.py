@@ -16,9 +16,7 @@ class CohortOptions:
 
     panel: ClassVar[str] = "Cohort"
     output: Annotated[Path, Option("OUT", "Folder for all outputs; an earlier run there is resumed.", letter="o")]
-    suffix: Annotated[str, Option("WORD", 'BIDS folder: suffix of its images, or with entities "acq-mprage_T1w".')] = (
-        "T1w"
-    )
+    suffix: Annotated[str, Option("WORD", "Suffix of images in a BIDS folder, such as acq-mprage_T1w.")] = "T1w"
     participants: Annotated[
         list[str] | None, Option("LABEL", "Run only this subject. May be repeated.", "participant-label")
     ] = None
@@ -33,7 +31,7 @@ class CohortOptions:
     retry_failed: Annotated[bool, Option(None, "Run only failed subjects; skip out-of-date ones.")] = False
     collect: Annotated[bool, Option(None, "Write the table and page of existing results; run nothing.")] = False
     workers: Annotated[
-        int | None, Option("N", "Maximum number of subjects at a time, or of a `cluster`'s jobs.", least=1)
+        int | None, Option("N", "Maximum number of simultaneous subjects, or of a `cluster`'s jobs.", least=1)
     ] = None
     scheduler: SchedulerOption = None
     cluster: ClusterOption = None

@@ -36,7 +36,7 @@ PAGE_COLUMNS = {
     "cells with angles below 10 degrees", "cells_without_voxel": "cells without a voxel", "energies.E": "E",
     "iterations_done": "iterations", "ended": "ended", "mask.distance_p95_mm": "distance to the mask, mm, 95 %",
     "mask.components": "components of the mask", "mask.mesh_components": "components of the mesh",
-    "memory.predicted_bytes": "memory predicted", "image": "image", "versions.tetopt": "version",
+    "memory.predicted_bytes": "predicted memory", "image": "image", "versions.tetopt": "version",
 }  # fmt: skip
 # Columns shown initially; those of the other quantities and of labels can be selected.
 FIRST_COLUMNS = (
@@ -110,7 +110,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     if n_odd := sum(bool(each) for each in flags):
         text += f" {n_odd} {'is' if n_odd == 1 else 'are'} flagged, see below."
     if seconds := present(row.numbers.get("seconds.all") for row in rows):
-        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing, excluding start-up and pictures."
+        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing time, excluding start-up and pictures."
     if peaks := present(row.numbers.get("memory.peak_bytes") for row in rows):
         text += f" The largest run used {units('bytes', 3)(max(peaks))} of memory."
     options = _options(rows)

@@ -113,7 +113,7 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             continue
         name = key(each)
         if len(name) > KEY_LETTERS:
-            words = f"{name[:20]}... has {len(name)} letters and is used in file names"
+            words = f"{name[:20]}... has {len(name)} characters and is used in file names"
             yield f"{each.place}: {words}; expected at most {KEY_LETTERS}"
             continue
         if name in places:
@@ -122,7 +122,7 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
     for name, place in places.items():
         if "_ses-" in name and name.partition("_")[0] in places:
             bare = name.partition("_")[0]
-            yield f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; add a session to both"
+            yield f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; give both a session"
 
 
 def table_text(path: Path, subjects: Sequence[Subject]) -> str:
@@ -214,7 +214,7 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
     if missing := [name for name in ("subject", "image") if name not in named]:
         separator = "tabs" if path.suffix.lower() == ".tsv" else "commas"
         raise InputError(
-            f"{path}: expected columns subject and image, between {separator}, got {', '.join(named) or 'none'}; "
+            f"{path}: expected columns subject and image, separated by {separator}, got {', '.join(named) or 'none'}; "
             f"missing {' and '.join(missing)}"
         )
     return columns

@@ -108,7 +108,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
     if moved.min() == top:
         raise InputError(
-            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit it or use another file"
+            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit them or use others"
         )
     return Image(moved, image.affine)
 
@@ -154,7 +154,7 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     fraction = float(in_box(other, image).mean())
     if fraction < LEAST_COVERED_FRACTION:
         raise InputError(
-            f"{name}: expected to cover half of the image's voxels or more, got {100 * fraction:.1f} %; "
+            f"{name}: expected it to cover at least half of the image's voxels, got {100 * fraction:.1f} %; "
             f"{_both_boxes(other, image)}"
         )
     return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
@@ -267,7 +267,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         values = np.unique(data)
         some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
         raise InputError(
-            f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
+            f"{name}: expected a mask (0 and one other value, or fractions from 0 to 1), got {len(values)} values from "
             f"{values[0]:g} to {values[-1]:g} ({some}); convert it to 0 and 1 first"
         )
     if top < INSIDE_FRACTION:

@@ -72,8 +72,8 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # like numpy's bins
     if low < high and not (steps[:-1] < steps[1:]).all():
         raise InputError(
-            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} to {high}; subtract the "
-            "offset common to all"
+            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} to {high}; subtract "
+            "their common offset"
         )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
     fraction = np.cumsum(counts) / counts.sum()

@@ -80,7 +80,7 @@ class Shape:
     kind : {"ellipsoid", "box", "layer"}
         Kind of the shape.
     center : (n,) float64
-        World mm.
+        World coordinates, mm.
     frame : (m, n) float64
         Unit rows, the shape's own axes in the world; m = n, or 1 for a layer.
     half : (m,) float64
@@ -198,7 +198,7 @@ class Phantom:
         Parameters
         ----------
         points : (..., n) array
-            World mm.
+            World coordinates, mm.
 
         Returns
         -------
@@ -223,7 +223,7 @@ class Phantom:
         Parameters
         ----------
         points : (..., n) array
-            World mm.
+            World coordinates, mm.
 
         Returns
         -------
@@ -504,7 +504,7 @@ class PhantomVoxels:
     shape : tuple of int
         Number of voxels along each axis.
     affine : (n+1, n+1) float64
-        Index -> world mm.
+        From index to world coordinates in mm.
     blur_mm, noise_sd : float
     seed, supersample : int
         As for `Phantom.image`.

@@ -38,9 +38,9 @@ BAND_STEPS, BAND_WIDTH = 5, 2.9  # sweeps, and the distance up to which they are
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
-    """Return a tissue's probabilities on the image's voxels, linear where they are on another grid.
+    """Return a tissue's probabilities on the image's voxels, interpolated linearly if their grid differs.
 
-    Whole numbers above 100 and up to 255, as in files of bytes without a scale, are divided by 255, with a warning.
+    Whole numbers with a maximum of 101 to 255, as in unscaled byte files, are divided by 255, with a warning.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     """
     low, high = tissue.range
     if PERCENT < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
-        warn(f"{name}: whole numbers up to {high:g}, read as probabilities times 255")
+        warn(f"{name}: whole numbers up to {high:g} are read as probabilities times 255")
         tissue = Image(tissue.data / BYTE_SCALE, tissue.affine)
     _check_range(name, tissue)
     return resample_contrast(tissue, image, name)
@@ -155,7 +155,7 @@ def probable_memberships(tissues: Sequence[Image], factors: Sequence[int]) -> Me
     values = np.flatnonzero(np.bincount(largest.ravel(), minlength=len(rows)))
     lost = sorted(set(range(1, len(rows))) - set(values.tolist()))
     if lost:
-        warn(f"tissues: never the most probable: number {', '.join(map(str, lost))}")
+        warn(f"tissues: no cell gets label {', '.join(map(str, lost))}, which is not the most probable in any voxel")
     second = np.partition(rows, -2, axis=0)[-2]
     first = rows.max(axis=0)
 

@@ -31,7 +31,7 @@ class Statistics(NamedTuple):
     noise : float
         Variance of the noise, equal to `Content.noise` of the image in memory to the last bit.
     scaled_noise : float
-        The same for intensities minus their mean, divided by their largest deviation from it.
+        The same for intensities minus their mean, divided by the largest deviation from the mean.
     is_whole : bool
         True if all intensities are whole numbers.
 

@@ -31,7 +31,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     """The discretization energy of equation (3), intensity^2 mm^n.
 
     The sum over cells of the integral of (h - hbar)^2, where hbar is the mean of h over the cell. h is constant on a
-    voxel, and each voxel counts whole in the cell that contains its centre. E_D lies between 0 and the image's variance
+    voxel, and each voxel counts fully in the cell that contains its centre. E_D lies between 0 and the image's variance
     times its volume.
 
     Parameters
@@ -39,7 +39,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     image : Image
         The intensities h, with the dimension of the mesh.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
 
     Returns
     -------

@@ -99,7 +99,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     image : Image
         The intensities h, 2-D or 3-D as the mesh is.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     image : Image
         The intensities h, 2-D or 3-D as the mesh is.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
 
     Returns
     -------
@@ -368,7 +368,7 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     bits = 28 - ceil(log2(reach))
     if bits < 8:
         raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in world mm?"
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are its points in mm?"
         )
     return bits
 

@@ -55,7 +55,7 @@ class IterationRecord(NamedTuple):
     E_D : float
         Discretization energy, intensity^2 mm^n.
     movement : float
-        `|x^t - x^(t-1)| / |x^(t-1)|`, with x from the box's centre.
+        `|x^t - x^(t-1)| / |x^(t-1)|`, with x relative to the box's centre.
     is_retessellated : bool
         True if the connectivity changed in this iteration.
     n_cells : int
@@ -106,9 +106,9 @@ class MeshingResult(NamedTuple):
     history : list of Record
         One row per iteration, starting with the initial mesh.
     ended : {"iterations", "converged", "max_seconds", "stopped"}
-        Why the run ended.
+        Reason for the end of the run.
     initial : Mesh
-        The mesh that the run began with.
+        The mesh at the start of the run.
     nodes : int, optional
         The requested number of nodes, or the number for the target error.
     seconds_start : float

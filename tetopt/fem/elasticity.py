@@ -313,7 +313,7 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.i
         if not is_there.any():
             raise InputError(
                 f"mesh: no node lies on the image's face at index {side:g} of axis {axis}; the mesh extends from "
-                f"{place.min():g} to {place.max():g}, but must fill the image's box: same image, crop and slice?"
+                f"{place.min():g} to {place.max():g}, not the whole box; is it of the same image, crop and slice?"
             )
     low, high = (np.flatnonzero(is_there) for is_there in (is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]))
     return low, high
@@ -343,11 +343,11 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
         inner = np.flatnonzero(~on_box)
         raise InputError(
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box; the first has nodes "
-            f"{outer[inner[0]].tolist()}: it has a crack or several components, or belongs to another image or crop"
+            f"{outer[inner[0]].tolist()}; the mesh has a crack or several components, or is of another image or crop"
         )
     filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-5:
-        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box: they overlap or leave gaps")
+        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box, so they overlap or leave gaps")
 
 
 def constrained(

@@ -59,8 +59,8 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
         raise InputError(f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; remove them")
     if not is_prescribed.any():
         raise InputError(
-            "mesh: it can move freely, as no displacement or spring constrains it; fix or support at least one set, "
-            "as hold:SET and spring:SET:K do"
+            "mesh: no displacement or spring constrains it, so it can move freely; fix or support at least one set, "
+            "for example with hold:SET or spring:SET:K"
         )
     body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
@@ -69,7 +69,7 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
         inside = np.flatnonzero(body == loose)
         raise InputError(
             f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still rotate or slide "
-            "as a whole: too few nodes connect them; fix more nodes or keep the largest facet-connected set"
+            "as a whole, as too few nodes connect them; fix more nodes or keep the largest facet-connected set"
         )
 
 

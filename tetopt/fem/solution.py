@@ -195,7 +195,7 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
         return on_curved_rule(model.gauss_young) if is_curved else model.gauss_young
     if model.node_young is not None:
         return gauss_young(model.node_young, model.mesh, model.order)
-    assert model.materials is not None, "who asks for moduli has checked that there are some"
+    assert model.materials is not None, "callers check that the model has moduli"
     of_cell = model.materials.young[model.materials.of_cell]
     return np.repeat(of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order, is_curved)[1]), axis=1)
 

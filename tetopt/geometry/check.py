@@ -39,7 +39,7 @@ def check_mesh(
     Parameters
     ----------
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     image : Image, optional
         The image whose box the mesh should fill, or lie in. Overlaps of cells that share no facet are found only if
         the mesh should fill it.

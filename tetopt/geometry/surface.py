@@ -43,7 +43,7 @@ class Surface(NamedTuple):
     Parameters
     ----------
     points : (N, 3) float64
-        World mm.
+        World coordinates, mm.
     triangles : (K, 3) int64
         Normals point out of the solid.
     n_parted : int
@@ -91,7 +91,7 @@ class _Sheets(NamedTuple):
 def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
     """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each node.
 
-    Where chosen cells touch only in a node or an edge, the sheets of the surface are parted. The flattest keeps its
+    Where chosen cells touch only in a node or an edge, the sheets of the surface are separated. The flattest keeps its
     place; the others move into the narrower of their two sides, the narrowest farthest, by 1/500 of the smallest
     height of the surrounding cells, or as far as float32 requires. So the solid separates there, and a ring closed
     only by an edge opens. A cavity's wall is a separate surface, with normals into the cavity.
@@ -99,7 +99,7 @@ def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], cho
     Parameters
     ----------
     points : (N, 3) array of float64
-        Nodes in world mm.
+        Nodes in world coordinates, mm.
     cells : (M, 4) array of int
         Positively oriented tetrahedra of a conforming mesh.
     chosen : (M,) array of bool, or (C,) array of int

@@ -158,7 +158,7 @@ def cells_of_rows(
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
             raise InputError(
-                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have another number"
+                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have a different number"
             )
         cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
     return cells

@@ -92,7 +92,7 @@ def _check(model: Model) -> None:
         )
     if model.is_nonlinear and (count := count_of_steps(model.loads)) > 1:
         raise InputError(
-            f"abaqus: expected one nonlinear step, got {count}, and each would continue from the previous one; write a "
+            f"abaqus: expected one nonlinear step, got {count} (each would continue from the previous one); write a "
             "file for each"
         )
     others = {name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)}

@@ -184,20 +184,20 @@ def save_mesh(
 ) -> None:
     """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at all.
 
-    Points are in world mm (RAS+), cells are positively oriented and of order 1 or 2. In VTK's formats each entry of
-    `about` becomes a field-data text, as JSON unless it is a string already. `save_model` also writes sets, materials
-    and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2. In VTK's formats each
+    entry of `about` becomes a string in the field data, as JSON unless it is one already. `save_model` also writes
+    sets, materials and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
     path : str or Path
         Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     cell_data : dict of arrays, optional
         By name, one row per cell.
     about : dict, optional
-        Texts for the file's header, by name.
+        Strings for the file's header, by name.
     point_data : dict of arrays, optional
         By name, one row per mesh point, or per node of order 2.
     order : {1, 2}
@@ -259,8 +259,8 @@ def _named(path: Path, model: Model) -> Model:
     """
     sets = [*model.sets.facets, *model.sets.cells]
     if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
-        words = f"letters, digits, _ and -, got {plain(odd[0])!r}"
-        raise InputError(f"{path}: expected set names of a letter and up to {MOST_LETTERS - 1} {words}")
+        words = f"letters, digits, _ or -, the first a letter, got {plain(odd[0])!r}"
+        raise InputError(f"{path}: expected set names of up to {MOST_LETTERS} {words}")
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
         raise InputError(f"{path}: two sets have the name {twice}; rename one of them")

@@ -90,7 +90,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     Returns the last increment of each step. Strains and stresses at nodes are CalculiX's: extrapolated from integration
     points and averaged over the surrounding cells. Nodes are matched by number, and their positions and cells are
     compared. Units and axes come from the header that tetopt writes to the input file and CalculiX copies; without it,
-    kPa is assumed, and the axes that fit.
+    kPa and the axes that fit are assumed.
 
     Parameters
     ----------

@@ -38,11 +38,11 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     Parameters
     ----------
     path : str or Path
-        A Zarr folder: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), of which the first multiscale level is
+        A Zarr folder: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), whose first multiscale level is
         used, or an array with the attribute "affine". Or an uncompressed NIfTI file (.nii).
     volume : int, optional
         One of several volumes, from 0: for files as in `tetopt.load_image`, for Zarr along its axes of time, channels
-        and others, of which the last varies fastest.
+        and others; the last varies fastest.
     crop : sequence of three (start, stop), optional
         Keep a box of voxels, as in `tetopt.load_image`.
 

@@ -60,7 +60,7 @@ def save_surface(
     path : str or Path
         Its name ends in .stl, .ply, .vtp or .vtk.
     surface : Surface
-        World mm, RAS+.
+        World coordinates in mm, RAS+.
     about : str, optional
         One line of ASCII for the header; STL keeps the first 60 characters, VTP nothing.
     space : {"ras", "lps"}
@@ -89,8 +89,8 @@ def save_surface(
         raise InputError(f"{path}: STL cannot store labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
     if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
         raise InputError(
-            f"{path}: expected names of labels of a letter and up to {MOST_LETTERS - 1} letters, digits, _ and "
-            f'-, got "{plain(odd[0])}"; rename them'
+            f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, "
+            f'got "{plain(odd[0])}"; rename them'
         )
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))

@@ -2,12 +2,12 @@
 
 `tetopt.io.vtkhdf` writes the same contents.
 
-Points are in world mm; cells are positively oriented and of one type: linear, or quadratic with straight edges, with
-corners first among the points. Data of cells and points are cell data and point data. Materials are cell data `young`,
-`nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell data
-`young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Texts are field data,
-as UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them. `loads` contains
-loads in text form.
+Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or quadratic with straight
+edges, with corners first among the points. Data of cells and points are cell data and point data. Materials are cell
+data `young`, `nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell
+data `young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Strings are
+field data, as UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them.
+`loads` contains loads in text form.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
 0, for ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data when they
@@ -167,7 +167,7 @@ def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str
             sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
         else:
             sets.cells[name] = field_data[key].ravel().astype(np.int64)
-    words = "dropped sets that are not ascending cells or facets, or have no unique name"
+    words = "dropped sets with invalid or repeated names, or without ascending cells or facets"
     return sets, (f"{words}: {', '.join(unfit)}",) if unfit else ()
 
 

@@ -191,19 +191,19 @@ class _Guarded:
         stored = int(each.id.get_storage_size())
         if stored > self.size or n_bytes > stored * (DEFLATE_RATIO if DEFLATE_FILTER in filters else 1):
             raise InputError(
-                f'damaged: "{shown}" should have {n_bytes} bytes, but the file stores {stored} of {self.size}'
+                f'damaged: "{shown}" declares {n_bytes} bytes, of which {stored} are in a file of {self.size}'
             )
         if h5py.check_string_dtype(each.dtype) is not None:
             return np.array(each.asstr(errors="backslashreplace")[()], dtype=np.str_)
         if each.dtype.kind not in "iufb":
-            raise InputError(f'"{shown}" has neither numbers nor texts ({each.dtype}); remove it from the file')
+            raise InputError(f'"{shown}" has neither numbers nor strings ({each.dtype}); remove it from the file')
         return np.asarray(each[()], dtype=each.dtype.newbyteorder("="))
 
     def counts(self, root: h5py.Group, name: str) -> list[int]:
         """Return one of the sizes of pieces."""
         values = self.array(root, name)
         if values.ndim != 1 or values.dtype.kind not in "iu" or not 0 < len(values) <= MOST_PIECES or min(values) < 0:
-            raise InputError(f"damaged: {name} is not one number for each of up to {MOST_PIECES} pieces")
+            raise InputError(f"damaged: expected one number in {name} for each of up to {MOST_PIECES} pieces")
         return [int(value) for value in values]
 
 

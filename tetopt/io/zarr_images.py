@@ -299,7 +299,7 @@ def _check_array(array: Any) -> None:
         raise InputError(f"unsupported codecs in its chunks: {plain(', '.join(unknown))}; write it again with others")
     packers = [name for name in names if name in PACKERS]
     if len(packers) > 1:
-        raise InputError(f"its chunks are compressed several times, by {', '.join(packers)}; write it again")
+        raise InputError(f"its chunks are compressed several times, by {', '.join(packers)}; use only one of these")
     shape = " x ".join(str(size) for size in array.chunks)
     n_bytes = math.prod(array.chunks) * dtype.itemsize
     check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again with smaller chunks")

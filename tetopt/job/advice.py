@@ -84,7 +84,7 @@ def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
         warning(
             f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the 95th percentile, "
-            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are larger than its details; "
+            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are too large for the details; "
             "allow more nodes"
         )
     if abs(mask.mesh_euler - mask.euler) > EULER_FRACTION * max(abs(mask.euler), EULER_USUAL):
@@ -115,8 +115,8 @@ def warn_of_result(
             "raised it; `retessellate` accept keeps only those that lower it"
         )
     if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
-        rise = f"{last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "above its initial value 0"
-        warning(f"E_D ended at {rise}: shapes were improved at the expense of E_D; increase `k_D`")
+        rise = f"to {last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "from 0"
+        warning(f"E_D rose {rise}, as shapes were improved at its expense; increase `k_D`")
     n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
         remedy = "reduce `nodes`"
@@ -128,8 +128,8 @@ def warn_of_result(
         )
     if crowded := measured.get("nodes_of_many_labels"):
         warning(
-            f"more than {MOST_MEETING} labels meet at {crowded} nodes, which lie where the first {MOST_MEETING} of "
-            "these meet"
+            f"more than {MOST_MEETING} labels meet at {crowded} nodes; only the first {MOST_MEETING} determine "
+            "where these nodes lie"
         )
 
 

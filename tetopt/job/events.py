@@ -1,4 +1,4 @@
-"""Events of a run: data with a text, which a terminal, a notebook or a program can show."""
+"""Events of a run: data with a line of text, which a terminal, a notebook or a program can show."""
 
 from __future__ import annotations
 

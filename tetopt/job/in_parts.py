@@ -112,9 +112,9 @@ def _unsupported_option(plan: Plan) -> str | None:
     """Return the message for an option that parts do not support; None if there is none."""
     job = plan.job
     if plan.mode != "graded":
-        return "`parts`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
+        return "`parts`: needs a graded mesh; omit it, or `uniform`, `spacing`, `lattice`, `method` and `start`"
     if len(job.images) > 1:
-        return f"`parts`: expected one IMAGE, got {len(job.images)}; leave out the others, or `parts`"
+        return f"`parts`: expected one IMAGE, got {len(job.images)}; omit the others, or `parts`"
     return _whole_only(plan, PARTS_TAKE)
 
 
@@ -122,7 +122,7 @@ def _whole_only(plan: Plan, taken: dict[str, Any]) -> str | None:
     """Return the message for the first option whose value is neither none nor the accepted one; None without any."""
     for name, value in taken.items():
         if getattr(plan.job, name) not in (None, value):
-            return f"`{name}`: needs all cells or voxels at once, which parts do not have; leave it out, or `parts`"
+            return f"`{name}`: needs all cells or voxels together, which parts do not have; leave it out, or `parts`"
     return None
 
 
@@ -237,7 +237,7 @@ def _check_room(need: Need, room: float) -> None:
     if need.task_bytes > room:
         raise InputError(
             f"a part needs about {memory_words(need.task_bytes)} of memory, and its worker "
-            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than it has; increase `parts`, reduce "
+            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than available; increase `parts`, reduce "
             "`workers`, or give them more memory"
         )
 

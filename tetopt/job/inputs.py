@@ -110,8 +110,8 @@ def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bo
     is_moved = original.shape == moved.shape and bool(other_box(original, moved))
     if is_moved or outside > OUTSIDE_FRACTION:
         warning(
-            f"{path}: {outside:.1%} of it lies outside the image, of which its box covers "
-            f"{in_box(original, moved).mean():.1%} ({'same shape, ' * is_moved}other affine); is it from the same scan?"
+            f"{path}: {outside:.1%} of it lies outside the image; its box covers {in_box(original, moved).mean():.1%} "
+            f"of the image ({'same shape, ' * is_moved}different affine); is it from the same scan?"
         )
 
 

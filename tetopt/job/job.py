@@ -25,14 +25,14 @@ Record = TypeVar("Record")
 FIRST = ("images", "output", "nodes", "mask", "labels", *kinds_of(SizeOptions))  # as users set them
 MOST_SAID = 80  # characters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar
-KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
+KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a string", bool: "True or False"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job(JobOptions):
-    """A run, from files to files, with each option of `tetopt mesh` as a field.
+    """A run of tetopt on files, with each option of `tetopt mesh` as a field.
 
-    Mappings and loads are texts as on the command line; a number is a mapping to one value. None means the default,
+    Mappings and loads are strings, as on the command line; a number is a mapping to one value. None means the default,
     which may depend on the image.
 
     Parameters
@@ -66,7 +66,7 @@ class Job(JobOptions):
         resolved(self)
 
     def given(self) -> dict[str, Any]:
-        """Return options that differ from the default, by name; paths as texts.
+        """Return options that differ from the default, by name; paths as strings.
 
         Returns
         -------

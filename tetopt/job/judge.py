@@ -103,7 +103,7 @@ def judge(
     Raises
     ------
     InputError
-        Files cannot be read, or the files that they belong to are missing; with `check`, the image has another box
+        Files cannot be read, or the files that they belong to are missing; with `check`, the image has a different box
         than that of the mesh's run.
     """
     if image is None and (mask is not None or labels is not None):

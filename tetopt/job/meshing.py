@@ -186,8 +186,8 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
-            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes, mid-edge ones included, of "
-            f"{job.nodes}; accepted: within {NODES_NEAR:.0%}"
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} of {job.nodes} nodes, including mid-edge "
+            f"nodes; accepted: within {NODES_NEAR:.0%}"
         )
 
 

@@ -148,7 +148,7 @@ def solver_model(
     young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
     is_of_file = solver.young is None and "young" in cell_data
     if not is_of_file and nu is None and "nu" in cell_data:
-        note(f"nu: from `young`, or {DEFAULT_NU:g}; the values in the mesh's file are ignored")
+        note(f"ignored nu in the mesh's file; nu comes from `young`, or is {DEFAULT_NU:g}")
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     model = build_model(
@@ -237,7 +237,7 @@ def model_of_file(
     mesh, fields = loaded.mesh, loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image))
     if image is not None and (outside := float((beyond_box(mesh, image) > 1.0).mean())) > 0.0:
         if outside == 1.0:
-            raise InputError("mesh and image: no node lies in the image's box; are both in the same world mm?")
+            raise InputError("mesh and image: no node lies in the image's box; do both use the same world coordinates?")
         warning(f"{outside:.1%} of the nodes lie outside the image: cells there take the nearest voxel's value")
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
@@ -331,7 +331,7 @@ def drop_early(early: Path) -> None:
     try:
         early.unlink(missing_ok=True)
     except OSError as error:
-        note(f"{early}: a copy of the mesh, which cannot be removed: {error.strerror}")
+        note(f"{early}: this copy of the mesh cannot be removed ({error.strerror})")
 
 
 def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:

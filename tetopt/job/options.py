@@ -70,7 +70,7 @@ class BoxPart:
     """Selected part of a volume file."""
 
     volume: Annotated[int | None, Option("K", "Volume of a 4-D file, from 0.")] = None
-    crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep these voxels, half-open; an end may be empty.")] = None
+    crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep voxels A to B - 1 and so on; an end may be empty.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class LabelledPart(ImagePart):
         Option("LABELS", "Label image: each cell gets its voxels' majority label, for modulus mappings and sets."),
     ] = None
     registered: Annotated[
-        bool, Option(None, "Accept another image than the mesh's, registered to it, though its box differs.")
+        bool, Option(None, "Accept an image other than the mesh's, registered to it, even if its box differs.")
     ] = False
 
 
@@ -125,7 +125,7 @@ class RegionOptions:
     weights: Annotated[str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")] = None
     smooth_interfaces: Annotated[
         float | None,
-        Option("W", "Smoothing of surfaces between labels, voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
+        Option("W", "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
     ] = None
     free_volumes: Annotated[
         bool, Option(None, "Let labels thinner than cells lose volume, which is preserved by default.")
@@ -171,16 +171,16 @@ class SizeOptions:
     ] = None
     size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = None
     edge_size: Annotated[
-        float | None, Option("MM", "Target edge length: longer edges are split while nodes remain.")
+        float | None, Option("MM", "Target edge length: longer edges are split while nodes are available.")
     ] = None
     edge_max: Annotated[
         float | None, Option("MM", "Maximum edge length (default 1.4 x a uniform mesh's; with `edge_size` none).")
     ] = None
     gradation: Annotated[
-        float | None, Option("G", "Gradation of sizes: each spans 1/G blocks, 0.05 (gentle) to 1 (default).")
+        float | None, Option("G", "Gradation, 0.05 (gentle) to 1 (default): each size is 1/G or more blocks wide.")
     ] = None
     cells_across: Annotated[
-        float | None, Option("N", "Number of cells across thin labels: edges of the local thickness / N.")
+        float | None, Option("N", "Number of cells across thin labels: target edges are the local thickness / N.")
     ] = None
     label_size: Annotated[
         str | None,
@@ -202,8 +202,8 @@ class StartOptions:
         Lattice | None,
         Option(
             "KIND",
-            "Initial mesh: octree (the default), with nodes where the image has detail; or uniform: bcc, five-tet, or "
-            "in 2-D criss-cross.",
+            "Initial mesh: octree (default), with nodes where the image has detail, or the uniform bcc, five-tet or, "
+            "in 2-D, criss-cross.",
         ),
     ] = None
     uniform: Annotated[bool, Option(None, "Use the paper's uniform lattice, bcc (criss-cross in 2-D).")] = False
@@ -243,7 +243,7 @@ class EngineOptions:
     ] = "fast"
     shape_power: Annotated[
         float | None,
-        Option("P", f"Fast method: 1 is the paper's E_G; up to 10 penalise flat cells (default {SHAPE_POWER:g})."),
+        Option("P", f"Fast method: 1 is the paper's E_G, 10 penalises flat cells most (default {SHAPE_POWER:g})."),
     ] = None
     min_dihedral: Annotated[
         float | None,
@@ -262,18 +262,18 @@ class EngineOptions:
         Retessellate | None,
         Option(
             None,
-            "Paper's method, Delaunay tessellation: in the first n_t iterations (default), if it lowers E, or never.",
+            "Paper's method: retessellate in the first n_t iterations (default), only if that lowers E, or never.",
         ),
     ] = None
     threads: Annotated[int | None, Option("N", "Number of threads; the result does not depend on it.")] = None
     max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the current mesh.")] = None
-    max_gb: Annotated[float | None, Option("GB", "Stop before using more than GB GB and write the current mesh.")] = (
+    max_gb: Annotated[float | None, Option("GB", "Stop before exceeding this memory and write the current mesh.")] = (
         None
     )
 
 
 WorkersOption = Annotated[
-    int | None, Option("N", "Maximum number of tasks, or of a `cluster`'s jobs, at a time.", least=1)
+    int | None, Option("N", "Maximum number of simultaneous tasks, or of a `cluster`'s jobs.", least=1)
 ]
 SchedulerOption = Annotated[
     str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
@@ -290,7 +290,7 @@ class PartsOptions:
     panel: ClassVar[str] = "Meshing in parts"
     parts: Annotated[
         int | None,
-        Option("K", "Mesh in K parts or more, each with its own voxels (default 1, or as memory requires).", least=1),
+        Option("K", "Mesh in K or more parts, each with its own voxels (default 1, or as memory requires).", least=1),
     ] = None
     workers: WorkersOption = None
     worker_gb: Annotated[float | None, Option("GB", "Memory limit of each worker on this machine.")] = None
@@ -308,7 +308,7 @@ class ModelOptions:
         Option(
             "MAPPING",
             'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
-            'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file of such columns.',
+            'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file with such columns.',
         ),
     ] = None
     nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, in the same forms (default {DEFAULT_NU:g}).")] = None
@@ -318,7 +318,7 @@ class ModelOptions:
     average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
         str | None,
-        Option("K[:quantile|:log]", "Group cells into K materials: bins of equal width, equal count, or log."),
+        Option("K[:quantile|:log]", "Group cells into K materials: bins of equal width, equal count or log width."),
     ] = None
     sets: Annotated[
         list[str] | None,
@@ -361,7 +361,7 @@ class ModelOptions:
 class SolverOptions(ModelOptions):
     """Settings of a solver's file."""
 
-    nonlinear: Annotated[bool, Option(None, "Use large deformation in the step (.inp; always in FEBio).")] = False
+    nonlinear: Annotated[bool, Option(None, "Make the step a large-deformation one (.inp; FEBio always does).")] = False
     units: Annotated[str, Option("kPa|MPa", "Unit of stress in the file; `young` is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 

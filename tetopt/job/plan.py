@@ -56,7 +56,7 @@ class Plan(NamedTuple):
     left : VolumeFile, optional
         The image of a run in parts, if it stays in its file.
     pictures : sequence of Path
-        Pictures to draw: slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail.
+        Pictures to draw: slice, rho, energies; with a mask, its boundary; with labels, the labels; a thumbnail.
 
     Examples
     --------
@@ -152,7 +152,7 @@ def plan(job: JobOptions) -> Plan:
     Raises
     ------
     InputError
-        As `Job`; an output may not be written.
+        As for `Job`; or an output may not be written.
 
     See Also
     --------

@@ -80,7 +80,7 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
     Raises
     ------
     InputError
-        As `tetopt.io.images.file_shape`, or `load_image` for a picture or DICOM, which is read.
+        As for `tetopt.io.images.file_shape`, or `load_image` for a picture or DICOM, which is read.
     """
     job, path = plan.job, plan.job.images[0]
     shape = cropped_shape(plan, (file_shape(path) or load_image(path, volume=job.volume).shape)[:3])

@@ -38,7 +38,7 @@ def read(job: Job) -> Task:
     Raises
     ------
     InputError
-        As `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
+        As for `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
         support.
 
     See Also
@@ -89,6 +89,6 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
     low, high = box_sides(image.shape).T
     is_in = ((index >= low) & (index <= high)).all(axis=1)
     if not is_in.any():
-        raise InputError(f"{path}: the mesh lies outside the image; are both in the same world coordinates, mm (RAS+)?")
+        raise InputError(f"{path}: the mesh lies outside the image; do both use the same world coordinates (mm, RAS+)?")
     if not is_in.all():
         warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not affected by it")

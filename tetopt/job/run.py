@@ -71,7 +71,7 @@ class Result(NamedTuple):
 
 
 def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = None) -> Result:
-    """Mesh images as a job specifies, and write its outputs, as `tetopt mesh` does, with the same bytes.
+    """Mesh images and write outputs as a job specifies, with the same bytes as `tetopt mesh`.
 
     Parameters
     ----------
@@ -90,8 +90,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     Raises
     ------
     InputError
-        As `Job`; files cannot be read or do not belong together; an output may not or cannot be written: the message
-        then says where the mesh is.
+        As for `Job`; files cannot be read or do not belong together; an output may not or cannot be written, and the
+        message says where the mesh is.
 
     See Also
     --------

@@ -104,7 +104,7 @@ def _check_options(image: Path | None, compress: float | None, model: ModelOptio
         most = f"{MOST_COMPRESSION_PERCENT:g}"
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
-        raise InputError("`compress` and `loads`: give only one, as in `loads` compress:5% `loads` pressure:left:1.5")
+        raise InputError("`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5")
     needs_image = {**stated_part(part), "registered": part.registered or None}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs an IMAGE, got only a mesh")

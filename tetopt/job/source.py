@@ -130,7 +130,7 @@ def read_source(
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = foreground_mask(image, level)
         note(
-            f"background: up to {level:g} and connected to the box's sides; {mask.data.mean():.1%} of the voxels remain"
+            f"background: voxels up to {level:g} connected to the box's sides; {mask.data.mean():.1%} of voxels remain"
         )
     balance = balance_of(options)
     if options.weights is None and is_own:

@@ -170,7 +170,7 @@ def _of_interfaces(
     if len(pairs) > 1:
         rows.append((f"all {len(pairs)}", str(len(areas)), f"{areas.sum():.6g}"))
     rim, seam = int((n_facets == 1).sum()), int((n_facets > 2).sum())
-    last = f"edges in one triangle: {rim}, in more than two: {seam}; read back: {written.area:.6g} mm2"
+    last = f"{rim} edges in one triangle, {seam} in more than two; area in the file: {written.area:.6g} mm2"
     of_pairs = [
         {"label_inside": pairs[k, 0], "label_outside": pairs[k, 1], "n_triangles": counts[k], "area_mm2": of_pair[k]}
         for k in range(len(pairs))

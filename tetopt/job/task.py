@@ -36,7 +36,7 @@ class Task(NamedTuple):
     size : RunSize
         Numbers of voxels, nodes and iterations, from which time and memory are predicted.
     request : dict
-        All that determines the outputs: options, checksums of files, the version.
+        Everything that determines the outputs: options, checksums of files, the version.
     by_label : SizesByLabel, optional
         Sizes of labels, if sizes by label are requested.
 

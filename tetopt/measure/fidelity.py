@@ -198,7 +198,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
 
     Returns
     -------
@@ -208,7 +208,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        Labels that are none, or as `tetopt.energy.sampling.cell_moments`.
+        Values that are not labels, or the reasons of `tetopt.energy.sampling.cell_moments`.
 
     Examples
     --------
@@ -234,7 +234,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell; `cell_labels` by default.
 
@@ -246,7 +246,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     Raises
     ------
     InputError
-        Labels that are none, not one label a cell, or as `tetopt.energy.sampling.cell_moments`.
+        Values that are not labels, not one label per cell, or the reasons of `tetopt.cell_moments`.
 
     Examples
     --------
@@ -333,7 +333,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     mask : Image
         From 0, outside, to 1, inside; fractions are partial volumes.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
 
     Returns
     -------
@@ -343,7 +343,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     Raises
     ------
     InputError
-        A mask with other values, or as `tetopt.energy.sampling.cell_moments`.
+        A mask with other values, or the reasons of `tetopt.energy.sampling.cell_moments`.
 
     Examples
     --------
@@ -396,12 +396,12 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     level : (s_0, ..., s_{n-1}) array of numbers or bool
         The field; voxel centres sit at the integer indices.
     affine : (n+1, n+1) float64
-        Index -> world mm.
+        From index to world coordinates in mm.
 
     Returns
     -------
     FacetSurface
-        World mm, accurate to 1e-5 voxel; without facets if the field does not cross 1/2.
+        World coordinates in mm, accurate to 1e-5 voxel; without facets if the field does not cross 1/2.
     """
     import pyvista  # slow to load, and only needed with a mask or labels
 
@@ -601,7 +601,7 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     n_voxels = int(moments.n_voxels.sum())
     if n_voxels == 0:
-        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
+        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
     mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
     spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
     n_empty = int((moments.n_voxels == 0).sum())

@@ -113,7 +113,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     Raises
     ------
     InputError
-        Labels that are none, or not one label a cell.
+        Values that are not labels, or not one label per cell.
 
     Examples
     --------
@@ -183,7 +183,7 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
     is_label : (s_0, ..., s_{n-1}) bool
         False in the outermost voxels; otherwise the surface is open there.
     affine : (n+1, n+1) float64
-        Index -> world mm.
+        From index to world coordinates in mm.
     """
     import pyvista  # slow to load, and only needed with labels
     from vtkmodules.util.numpy_support import vtk_to_numpy

@@ -49,7 +49,7 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     """
     moments = cell_moments(image, mesh)
     if not moments.n_voxels.any():
-        raise InputError("mesh and image: no voxel centre lies inside the mesh; are both in the same world mm?")
+        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
     owner = cell_of_voxel(image, mesh)
@@ -91,7 +91,7 @@ def dice(labels: Image, truth: Image) -> dict[int, float]:
 def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
     """Number of voxels of each class (rows) and true label (columns)."""
     if labels.shape != truth.shape:
-        raise InputError(f"dice: expected images of one shape, got {labels.shape} and {truth.shape}")
+        raise InputError(f"dice: expected images of the same shape, got {labels.shape} and {truth.shape}")
     for name, image in (("labels", labels), ("truth", truth)):
         check_labels(name, image)
     classes, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()

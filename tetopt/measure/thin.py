@@ -71,7 +71,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     of_cell : (M,) array of whole numbers
         Label of each cell, such as from `tetopt.cell_labels`.
     mask : Image, optional
@@ -85,7 +85,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     Raises
     ------
     InputError
-        Values that are no labels, not one label a cell, or a mask on other voxels.
+        Values that are not labels, not one label per cell, or a mask on other voxels.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def label_thickness(
         A content with smooth labels: their levels give the smooth surfaces, and both are measured at its voxels (finer
         ones if slices are thick).
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     of_cell : (M,) array of whole numbers
         Label of each cell.
 

@@ -56,22 +56,22 @@ def build_model(
     ----------
     mesh : Mesh or MeshFile
         The contents of a file (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
-        nodes, labels and their names, sets, moduli, loads, the image's box, and texts on its origin. Solver results are
-        kept if moduli and loads are.
+        nodes, labels and their names, sets, moduli, loads, the image's box, and strings on its origin. Solver results
+        are kept if moduli and loads are.
     image : Image, optional
         Mappings are applied to its intensities, and the faces of its box become sets.
-    young, nu : number, (M,) array, mapping or text, optional
+    young, nu : number, (M,) array, mapping or str, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one per cell, or
         a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`). With an image, a mapping
         of the intensity is averaged over the voxels of each cell; without, it is applied to the cell's "mean". Without
         `young` the model has no materials. `nu` defaults to the column "nu" of the file that `young` names, or to 0.45.
-    density : number, (M,) array, mapping or text, optional
+    density : number, (M,) array, mapping or str, optional
         Density, kg/m3, above 0, in the same forms; defaults to the column "density" of the file that `young` names, or
         to none. Gravity needs it.
     average : str
         The average of Young's modulus over voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
         With "gauss" and quadratic cells, moduli vary within a cell in `tetopt.fem.solution.solve`, not in files.
-        Ratios and densities are always the mean.
+        Ratios and densities are always averaged by the mean.
     sets : iterable of str
         Additional sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
@@ -92,7 +92,7 @@ def build_model(
     box : Box, optional
         The box of the meshed image; by default that of `image`.
     about : dict, optional
-        Texts for the file's header. Its "label_table", a `LabelTable` or the result of
+        Strings for the file's header. Its "label_table", a `LabelTable` or the result of
         `tetopt.model.labels.table_words`, gives the names of labels in mappings and in the standard sets.
 
     Returns

@@ -29,7 +29,7 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
     Parameters
     ----------
     mesh : Mesh
-        Points in world mm.
+        Points in world coordinates, mm.
     image : Image, optional
         Without it, the fields of the image are omitted.
 

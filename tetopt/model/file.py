@@ -75,7 +75,7 @@ class MeshFile(NamedTuple):
     point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
 
     def text(self, name: str) -> str | None:
-        """Return a text from the field data, if present.
+        """Return a string from the field data, if present.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class MeshFile(NamedTuple):
         Returns
         -------
         str or None
-            None if it is missing or not a text.
+            None if it is missing or not a string.
 
         Examples
         --------

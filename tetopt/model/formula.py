@@ -43,7 +43,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     array([  50.,  100., 1000.])
     """
     if len(text) > MOST_FORMULA_LETTERS:
-        raise InputError(f'formula: expected at most {MOST_FORMULA_LETTERS} letters, got "{_shown(text[:1000])}"')
+        raise InputError(f'formula: expected at most {MOST_FORMULA_LETTERS} characters, got "{_shown(text[:1000])}"')
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # for "1if h" Python only issues a warning

@@ -127,7 +127,7 @@ def check_steps(loads: Iterable[Load]) -> None:
     for expected, number in enumerate(numbers, start=1):
         if number != expected:
             raise InputError(
-                f"load: loads have a step {numbers[-1]}, but none has step {expected}; number steps from 1"
+                f"load: some loads are in step {numbers[-1]}, but none in step {expected}; number steps from 1"
             )
 
 

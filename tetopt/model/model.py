@@ -83,7 +83,7 @@ class Model(NamedTuple):
     is_nonlinear : bool
         True if steps are solved with large deformation.
     about : dict
-        Texts, or values in JSON's types, by name, for the file's header.
+        Strings, or values in JSON's types, by name, for the file's header.
     point_data : dict of arrays
         By name, one row per mesh point, or per node of order 2.
 

@@ -69,7 +69,7 @@ class Box(NamedTuple):
     shape : tuple of int
         Number of voxels along each axis.
     affine : (n+1, n+1) float64
-        Index -> world mm.
+        From index to world coordinates in mm.
 
     Examples
     --------
@@ -359,7 +359,7 @@ def parse_set(text: str, ndim: int) -> SetRequest:
         raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
     if not SET_NAME.fullmatch(name):
         raise InputError(
-            f'set: expected a name of a letter and up to {MOST_LETTERS - 1} letters, digits, _ and -, got "{name}"'
+            f'set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, got "{name}"'
         )
     form, counts = shapes[kind]
     parts = rest.split(":")
@@ -385,7 +385,7 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
     for name in request.names():
         if name.lower() in taken:
-            raise InputError(f'set: a set "{taken[name.lower()]}" exists already; choose another name than "{name}"')
+            raise InputError(f'set: a set "{taken[name.lower()]}" already exists; choose a name other than "{name}"')
 
 
 def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:

@@ -174,7 +174,7 @@ def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelG
         if twice := [each for each in taken if taken.count(each) > 1]:
             raise InputError(f"`merge`: expected a different {what} for each group, got {twice[0]} twice")
     if max(group.label for group in groups) > LARGEST_LABEL:
-        raise InputError(f"`merge`: expected numbers of groups up to {LARGEST_LABEL}")
+        raise InputError(f"`merge`: expected group numbers up to {LARGEST_LABEL}")
     if sum(REST in group.members for group in groups) > 1:
         raise InputError(f"`merge`: expected {REST} in at most one group, got it in two")
     return groups

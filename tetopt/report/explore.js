@@ -479,7 +479,7 @@ function explore(gl, data, notes) {
   choose("axis", [["none", -1], ["sagittal", 0, "across R-L"], ["coronal", 1, "across A-P"],
     ["axial", 2, "across S-I"]], (axis) => change({ axis }));
   choose("side", [["", false], ["", true]], (isTurned) => change({ isTurned }));
-  choose("style", [["through cells", false], ["whole cells", true, "cells whose centroids are beyond are hidden"]],
+  choose("style", [["through cells", false], ["whole cells", true, "cells whose centroids lie beyond the cut are hidden"]],
     (isWhole) => change({ isWhole }));
   choose("inside", [["mesh", "cells"], ["image", "image"], ["both", "both"]], (inside) => change({ inside }));
   choose("lines", [["lines of cells", "cells"], ["of labels", "labels"]], (lines) => change({ lines }));

@@ -60,7 +60,7 @@ def save_run_figures(
     image to show.
     """
     first, last = result.history[0], result.history[-1]
-    fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
+    fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
     before = f"{start}, {len(initial.points)} nodes"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]

@@ -189,7 +189,7 @@ def plane_slice(image: Image, axis: int, at: float) -> pyvista.PolyData:
     Returns
     -------
     pyvista.PolyData
-        World mm, with cell data `h`, the voxels' values.
+        World coordinates, mm, with cell data `h`, the voxels' values.
     """
     voxels = pyvista.ImageData(dimensions=np.array(image.shape) + 1, origin=(-0.5, -0.5, -0.5))
     voxels.cell_data["h"] = image.data.ravel(order="F")

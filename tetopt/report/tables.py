@@ -88,7 +88,7 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
     ):  # fmt: skip
         mean, p95, mean_mm, p95_mm = (f"{distance:.3f}" for distance in distances)
         is_there = not np.isnan(distances).any()  # both surfaces exist off the faces of the box
-        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one of them is missing", "")
+        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one surface is missing", "")
         table.add_row(title, *shown)
     table.add_row("connected components", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))

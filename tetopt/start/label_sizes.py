@@ -89,7 +89,7 @@ class LabelLayers(NamedTuple):
     cells_across : float
         Median of thickness over target.
     below : float
-        Fraction of its voxels with fewer cells across than requested; 0 if no number is, as for label 0.
+        Fraction of its voxels with fewer cells across than requested; 0 if none is requested, as for label 0.
 
     Examples
     --------
@@ -269,7 +269,7 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     if members is None:
         raise InputError("sizes: cells_across and by_label require labels with smooth interfaces; give labels")
     if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
-        raise InputError(f"cells_across: expected above 0 to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
+        raise InputError(f"cells_across: expected above 0 and up to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
     by_label = {
         label: size if isinstance(size, LabelSize) else parse_label_size(size)
         for label, size in (sizes.by_label or {}).items()

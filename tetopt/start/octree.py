@@ -123,8 +123,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     if is_near(count, nodes) or content.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
-        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {_given(content, sizes)}: the "
-        f"nearest octree found has {count}; use about as many, or a uniform mesh"
+        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {_given(content, sizes)}; the "
+        f"nearest octree found has {count}: use about as many, or a uniform mesh"
     )
 
 
@@ -156,7 +156,7 @@ def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _Bl
     if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         enough = max(_coarsest_nodes(content, nodes, limits), SIZED_OVER_EQUILATERAL * by_target)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {_given(content, sizes)}: they need at least {least:.4g}; "
+            f"octree: {nodes} nodes are too few for {_given(content, sizes)}, which need at least {least:.4g}; "
             f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
 

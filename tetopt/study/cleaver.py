@@ -112,7 +112,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
     except InputError as error:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:
-        notes.append(f"{n_removed} cells outside the box removed")
+        notes.append(f"removed {n_removed} cells outside the box")
     n_nodes = node_count(points, cells, order)
     if not is_near(n_nodes, nodes):
         notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver; requested: {nodes}")

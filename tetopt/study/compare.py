@@ -457,7 +457,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     key = _key(bench, name)
     kept = _kept(path, key) if bench.resume else None
     if kept is not None:
-        note(f"{title}, {nodes} nodes: finished before")
+        note(f"{title}, {nodes} nodes: already finished")
         return kept
     note(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings

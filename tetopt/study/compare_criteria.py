@@ -59,7 +59,7 @@ def criteria(report: Report) -> list[Criterion]:
     ratios = fem_ratios(report)
     return [
         Criterion("Image", "Image", "E_D, fraction of the image's variance", _at("E_D_fraction"), -1, is_headline=True,
-            blind="where the error is, and whether it matters there: noise within a cell counts like an edge"),
+            blind="where the error is, and whether it matters there; noise within a cell counts like an edge"),
         Criterion("Image", "Image", "voxels outside the mesh", _at("n_missed_voxels"), -1, is_detail=True),
         *_label_criteria(report),
         *_shape_criteria(),
@@ -99,9 +99,9 @@ def _shape_criteria() -> list[Criterion]:
     return [
         row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail (1/3: regular tetrahedron)"),
         row("p1 rho", ("p1_rho",), 1, "the worst 1 % of the cells"),
-        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells come close: it is one cell's angle"),
+        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells come close (it is one angle)"),
         Criterion("Shape", "Shape", "bad cells (3 rho < 0.3), %", bad_percent, -1, is_headline=True,
-            blind="how bad they are, and their kind: slivers harm a stiffness matrix more than needles (below)"),
+            blind="how bad they are, and their kind; slivers harm a stiffness matrix more than needles (below)"),
         row("min rho", ("min_rho",), 1),
         *(row(f"error {title}", ("errors", name), -1) for name, title in errors.items()),
         row("dihedral angle p1, °", ("p1_dihedral",), 1),
@@ -140,7 +140,7 @@ def _label_criteria(report: Report) -> list[Criterion]:
         ("smallest label Dice", over(min, attrgetter("dice")), 1, "all labels but one"),
         ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1, "single spikes and holes"),
         ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1, "the 5 % beyond it"),
-        ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is: lost and gained "
+        ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is; lost and gained "
             "parts cancel each other"),
         ("labels lost (of any size)", _n_lost, -1, "labels that keep a single cell"),
         ("label area over smoothed voxels', weighted mean", by_voxels(attrgetter("area_ratio")), 0, ""),
@@ -198,7 +198,7 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
     word, average = ORDER_WORDS[order], report.options.average
     part = f"Compression, ν = {nu}, {word} cells"
     blind = {
-        "strain_energy": "errors that cancel each other: it is one number for the whole body",
+        "strain_energy": "errors that cancel each other (it is one number for the whole body)",
         "displacement": "strains, which may be wrong even if displacements are right",
         "interface_strain": "anything but the voxels next to interfaces of the labels or classes",
     }

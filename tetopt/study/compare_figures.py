@@ -63,7 +63,7 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
         There are no meshes, or their number differs from that of means.
     """
     if not meshes or len(meshes) != len(means):
-        raise InputError(f"slices_figure: expected one array of means for each mesh, got {len(means)}, {len(meshes)}")
+        raise InputError(f"slices_figure: got {len(means)} arrays of means for {len(meshes)} meshes; give one for each")
     view = SliceView(image, None, None)
     width = 3.3 if len(meshes) > 2 else 4.6
     figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")

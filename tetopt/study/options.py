@@ -88,7 +88,7 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
         _check_limit("max_gb", self.max_gb)
         parse_average(self.average)
         if self.reference_seconds is not None and self.reference_dofs is not None:
-            raise InputError("`reference_seconds`: `reference_dofs` already sets the size of the reference; give one")
+            raise InputError("`reference_seconds`: `reference_dofs` already sets the size of the reference; omit one")
         _check_limit("reference_seconds", self.reference_seconds)
         programs = _programs(self.programs or [])
         names = [name.strip() for name in self.pipelines.split(",")]

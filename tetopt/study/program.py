@@ -79,13 +79,13 @@ def parse_program(text: str) -> Program:
         raise InputError(f"{where}: unbalanced quotes ({error}): {command}") from error
     used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
     if unknown := sorted(used - set(PLACEHOLDERS)):
-        raise InputError(f"{where}: expected placeholders of {_braced(PLACEHOLDERS)}, got {{{unknown[0]}}}")
+        raise InputError(f"{where}: unknown placeholder {{{unknown[0]}}}; use {_braced(PLACEHOLDERS)}")
     if "output" not in used or not used & {"image", "labels"}:
         raise InputError(f"{where}: expected {{output}}, and {{image}} or {{labels}} or both, got: {command}")
     for word in words:
         suffix = _suffix(word)
         if suffix is not None and suffix not in MESH_SUFFIXES:
-            raise InputError(f"{where}: the mesh must be named {', '.join(MESH_SUFFIXES)}, got {{output}}{suffix}")
+            raise InputError(f"{where}: the mesh's name must end in {', '.join(MESH_SUFFIXES)}, got {{output}}{suffix}")
     if shutil.which(words[0]) is None:
         raise InputError(f'{where}: found no executable program "{words[0]}"; give its path, or add its folder to PATH')
     return Program(name, command)
