@@ -387,9 +387,9 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
 
 
 def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path, capsys):
-    """A finer grid of the same box is another contrast; more of the world may be another subject."""
+    """A finer grid of the same box, to a voxel, is another contrast; more of the world may be another subject."""
     image = tetopt.load_image(folder / "a.nii.gz")
-    grids = {"finer": (0.5, 0.0), "moved": (1.0, 2.0), "far": (1.0, 99.0)}
+    grids = {"finer": (0.5, 0.0), "half_off": (0.25, 0.5), "moved": (1.0, 2.0), "far": (1.0, 99.0)}
     for name, (step, shift) in grids.items():
         data = np.repeat(image.data, round(1 / step), axis=0)
         affine = image.affine @ np.diag([step, 1.0, 1.0, 1.0])
@@ -397,8 +397,9 @@ def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path,
         tetopt.save_image(tmp_path / f"{name}.nii", tetopt.Image(data, affine))
     mapping = ["--young", MAPPING]
     convert = ["convert", folder / "a.vtu", tmp_path / "a.inp", *mapping, "--force", "--image"]
-    assert exit_code(*convert, tmp_path / "finer.nii") == 0
-    assert "a.vtu was built from a different image" in capsys.readouterr().err
+    for name in ("finer", "half_off"):
+        assert exit_code(*convert, tmp_path / f"{name}.nii") == 0
+        assert "a.vtu was built from a different image" in capsys.readouterr().err
     expected = r"tetopt: .*moved.nii: expected the box of .*a.vtu's image, a.nii.gz, .* mm, got .* pass --registered\n"
     fem = ["fem", tmp_path / "moved.nii", folder / "a.vtu", *mapping, "--load", "compress:1%"]
     for words in ([*convert, tmp_path / "moved.nii"], fem):

@@ -290,7 +290,9 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     turned = OBLIQUE @ np.diag([-1.0, 1.0, 1.0, 1.0])
     turned[:3, 3] = image.to_world([image.shape[0] - 1.0, 0.0, 0.0])
     tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[::-1], turned))
-    for name in ("wide", "turned"):
+    turned[:3, 3] = image.to_world([image.shape[0] + 0.5, 0.0, 0.0])  # and elsewhere, as labels of FreeSurfer
+    tetopt.save_image(tmp_path / "aside.nii.gz", tetopt.Image(mask.data[::-1], turned))
+    for name in ("wide", "turned", "aside"):
         exit_code(*command, "--mask", tmp_path / f"{name}.nii.gz")
         said = capsys.readouterr().err
         assert f"{name}.nii.gz: resampled" in " ".join(said.split())

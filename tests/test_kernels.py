@@ -204,6 +204,8 @@ WAITING = "import tetopt.cluster.tasks, numba; numba.set_num_threads(1); print(n
 def test_threads_wait_without_spinning(tmp_path, monkeypatch, chosen):
     """Unless the user wants them to: on a busy machine, spinning threads take the time of those that compute."""
     monkeypatch.delenv("OMP_WAIT_POLICY")  # of this process, which imported tetopt
+    kept = ran(tmp_path, "import os, tetopt; print(os.environ['OMP_WAIT_POLICY'])", **chosen).stdout
+    assert kept == f"{chosen.get('OMP_WAIT_POLICY', 'passive')}\n"
     shown = ran(tmp_path, WAITING, OMP_DISPLAY_ENV="verbose", **chosen)
     if shown.stdout != "omp\n" or "GOMP" not in shown.stderr:
         pytest.skip("threads of another library than GNU's OpenMP")

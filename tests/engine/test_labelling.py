@@ -121,6 +121,27 @@ def test_moves_lower_the_energy(n):
             assert energy(changed) >= after - 1e-6
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_faults_that_are_skipped_are_none(monkeypatch, n):
+    """The same labels whether or not nodes marked sound are skipped, for cells of random content."""
+    mend, n_skipped = labelling._mend, 0
+
+    def without_marks(dual, labels, room, is_bridge, faces, is_near, is_sound, work):
+        nonlocal n_skipped
+        n_skipped += np.count_nonzero(is_sound)
+        mend(dual, labels, room, is_bridge, faces, is_near, np.zeros_like(is_sound), work)
+
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        points, cells = box(n, 60, seed)
+        counts = csr_array(rng.random((len(cells), 3)) ** 4 * volumes(points, cells)[:, None])
+        own = solved(points, cells, None, 3, counts=counts, weight=0.05)
+        with monkeypatch.context() as patched:
+            patched.setattr(labelling, "_mend", without_marks)
+            np.testing.assert_array_equal(solved(points, cells, None, 3, counts=counts, weight=0.05).labels, own.labels)
+    assert n_skipped > 0
+
+
 @pytest.mark.full
 def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""

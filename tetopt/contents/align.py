@@ -295,9 +295,11 @@ def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> boo
 def other_box(grid: Any, image: Image, tolerance: float = SAME_BOX_VOXELS) -> str:
     """Return "A mm, got B mm", the extents of a grid's box and an image's, if these are different boxes, else "".
 
-    The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels, in any order of the axes.
+    The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels of the coarser one, in any
+    order of the axes.
     """
-    is_near = is_on_sides(image.to_index(_world_corners(grid)), box_sides(image.shape), tolerance)
+    ratio = np.linalg.norm(grid.affine[:-1, :-1], axis=0).max() / min(image.spacing)
+    is_near = is_on_sides(image.to_index(_world_corners(grid)), box_sides(image.shape), tolerance * max(ratio, 1.0))
     return "" if is_near.any(axis=-1).all() else f"{_extent(grid)} mm, got {_extent(image)} mm"
 
 

@@ -101,13 +101,16 @@ def image_and_others(
 def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
     """Report that a file was resampled; warn of a mask or labels that seem to be of another scan.
 
-    These are cut by the image's box, though the image is no crop of them, or have its shape in another place.
+    These are cut by the image's box, though the image is no crop of them, or have its shape and directions in another
+    place. Labels of FreeSurfer have their own directions.
     """
     note(f"{path}: resampled to the image's grid ({'linear' if is_contrast else 'nearest neighbour'})")
     if is_contrast or is_cropped or is_same_grid(original, moved, is_cropped=True):
         return
     outside = 1.0 - float(in_box(moved, original)[original.data >= min(INSIDE_FRACTION, original.data.max())].mean())
-    is_moved = original.shape == moved.shape and bool(other_box(original, moved))
+    cosines = [(each.affine[:-1, :-1] / each.spacing) for each in (original, moved)]
+    is_alike = original.shape == moved.shape and bool((np.prod(cosines, axis=0).sum(axis=0) > 0.5).all())
+    is_moved = is_alike and bool(other_box(original, moved))
     if is_moved or outside > OUTSIDE_FRACTION:
         warning(
             f"{path}: {outside:.1%} of it lies outside the image; its box covers {in_box(original, moved).mean():.1%} "

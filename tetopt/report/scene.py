@@ -26,7 +26,7 @@ SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right,
 GLASS_OPACITY = 0.6  # of the cells' colours over the image: colours are distinct, and voxels remain visible
 ABOVE_IMAGE = 1e-3  # distance of the cells in a section from the image there, as a fraction of the mesh's extent
 SCENE_ZOOM = 1.05
-KEY_FRACTION = 0.1  # of the picture's width, for a colour bar or legend beside the scene
+BAR_FRACTION, LEGEND_FRACTION = 0.1, 0.2  # of the picture's width, for a colour bar or legend beside the scene
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
@@ -127,7 +127,7 @@ def opened_mesh(shown: Exhibit) -> Draw:
 
     def draw(plotter: pyvista.Plotter) -> None:
         plotter.enable_parallel_projection()  # keeps all of it in the picture
-        plotter.camera.SetWindowCenter(KEY_FRACTION, 0.0)
+        plotter.camera.SetWindowCenter(LEGEND_FRACTION if field.categories else BAR_FRACTION, 0.0)
         plane = {"normal": np.eye(3)[axis], "origin": middle}
         behind, section = grid.extract_surface(algorithm="dataset_surface").clip(**plane), grid.slice(**plane)
         if behind.n_cells:
