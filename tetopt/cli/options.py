@@ -141,10 +141,10 @@ def _converter(name: str, kind: Any, number: Callable[[str], int | float]) -> Ca
     """Return a function that converts an option's string, or raises InputError for what is no number of its kind."""
 
     def converted(value: Any) -> Any:
-        given = value
+        text = value
         for convert in (float, number):  # 5e3 is a whole number, too
             with suppress(ValueError, TypeError):  # a string that `of_option` rejects, or None
-                value = convert(given)
+                value = convert(text)
         return of_option(name, kind, value)
 
     return converted

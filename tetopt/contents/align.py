@@ -17,7 +17,7 @@ from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
-from tetopt.geometry.box import box_sides, is_on_sides
+from tetopt.geometry.box import box_sides
 from tetopt.image import Image, transformed
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
@@ -298,8 +298,9 @@ def other_box(grid: Any, image: Image, tolerance: float = SAME_BOX_VOXELS) -> st
     The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels of the coarser one, in any
     order of the axes.
     """
-    ratio = np.linalg.norm(grid.affine[:-1, :-1], axis=0).max() / min(image.spacing)
-    is_near = is_on_sides(image.to_index(_world_corners(grid)), box_sides(image.shape), tolerance * max(ratio, 1.0))
+    steps = np.abs(np.linalg.inv(image.affine[:-1, :-1]) @ grid.affine[:-1, :-1]).max(axis=1)  # the grid's, voxels
+    off = np.abs(image.to_index(_world_corners(grid))[..., None] - box_sides(image.shape))
+    is_near = off <= tolerance * np.maximum(steps, 1.0)[:, None]
     return "" if is_near.any(axis=-1).all() else f"{_extent(grid)} mm, got {_extent(image)} mm"
 
 

@@ -273,7 +273,7 @@ class EngineOptions:
 
 
 WorkersOption = Annotated[
-    int | None, Option("N", "Maximum number of simultaneous tasks, or of a `cluster`'s jobs.", least=1)
+    int | None, Option("N", "Maximum number of simultaneous tasks, or of jobs, with `cluster`.", least=1)
 ]
 SchedulerOption = Annotated[
     str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")

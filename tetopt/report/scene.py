@@ -25,7 +25,7 @@ STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices be
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right, in front and above
 GLASS_OPACITY = 0.6  # of the cells' colours over the image: colours are distinct, and voxels remain visible
 ABOVE_IMAGE = 1e-3  # distance of the cells in a section from the image there, as a fraction of the mesh's extent
-SCENE_ZOOM = 1.05
+SCENE_ZOOM = 1.05  # times the size at which the scene surely fits
 BAR_FRACTION, LEGEND_FRACTION = 0.1, 0.2  # of the picture's width, for a colour bar or legend beside the scene
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
