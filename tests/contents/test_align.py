@@ -344,3 +344,32 @@ def test_levels_that_leave_nothing():
     data = np.zeros((40, 40))
     data[20, 20] = 1.0
     np.testing.assert_array_equal(foreground_mask(tetopt.Image(data), 0.0).data, data)
+
+
+def test_foreground_of_labels_by_hand():
+    """A detached label of one voxel stays; a pocket at the side goes, however small; a cavity stays."""
+    labels = np.zeros((30, 32, 28))
+    labels[ball(labels.shape, 10)] = 1.0
+    labels[ball(labels.shape, 4)] = 0.0
+    labels[4, 4, 4], labels[20:, 10:20, 10:20], labels[-1, 15, 14] = 3.0, 2.0, 0.0
+    labels[(slice(0, 2), 0, 0)] = 5.0  # at the side, too
+    image = tetopt.Image(labels)
+    front = foreground_mask(image, 0.0, image)
+    cavity = ball(labels.shape, 4) & (labels == 0)
+    np.testing.assert_array_equal(front.data, (labels > 0) | cavity)
+    # Labels of a grey image: dark labelled voxels stay, and bright specks without a label go.
+    data = np.where(labels == 1, 100.0, 0.0)
+    data[2, 28, 2] = 100.0
+    grey = tetopt.Image(data)
+    np.testing.assert_array_equal(foreground_mask(grey, 0.0, image).data, (labels > 0) | cavity)
+    assert message(foreground_mask, grey, 0.0, tetopt.Image(labels[1:])).startswith(
+        "labels: expected the image's shape"
+    )
+
+
+def test_a_large_bright_piece_is_not_removed_silently():
+    """5 of radius against 25: 515 voxels of 65,000, as a gland beside a body."""
+    data = np.where(ball((60, 60, 60), 24, (26, 30, 30)), 1.0, 0.0)
+    data[ball(data.shape, 5, (54, 6, 6))] = 1.0
+    with pytest.warns(UserWarning, match=r"bright ones are removed: 1, 515 mm3 in all, the largest 515 mm3"):
+        assert foreground_mask(tetopt.Image(data), 0.0).data[54, 6, 6] == 0

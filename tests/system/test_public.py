@@ -29,7 +29,7 @@ RIGHT = {
     "cell_of_voxel": {"image": IMAGE, "mesh": MESH},
     "check_mesh": {"mesh": MESH, "image": None},
     "content": {"images": [IMAGE], "weights": [1.0]},
-    "foreground_mask": {"image": IMAGE, "level": 0.5},
+    "foreground_mask": {"image": IMAGE, "level": 0.5, "labels": LABELS},
     "label_contacts": {"labels": LABELS, "mesh": MESH, "of_cell": [1], "mask": None},
     "label_fidelity": {"labels": LABELS, "mesh": MESH},
     "label_interfaces": {"labels": LABELS, "mesh": MESH, "of_cell": [1]},

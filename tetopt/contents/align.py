@@ -7,7 +7,7 @@ their shapes. The domain of a grid is the box of its voxels, from index -0.5 to 
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image, transformed
 
@@ -26,6 +26,8 @@ LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further co
 BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median, up to which voxels count as background
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
 SMALL_COMPONENT_FRACTION = 0.01  # of the largest component's voxels: smaller components are ignored
+SUSPECT_VOXELS = 200  # of a bright piece: a larger one is hardly noise
+KEEP_PIECES = "`labels` keep what they number; a `mask` replaces the rule"
 LEAST_CLASS_FRACTION = 0.001  # of the voxels: a background or foreground found without a level must have more
 
 
@@ -160,13 +162,38 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
 
 
-def foreground_mask(image: Image, level: float | None = None) -> Image:
+class Foreground(NamedTuple):
+    """The foreground of an image, and its small pieces."""
+
+    mask: Image  # float32, 0 and 1
+    dropped: NDArray[np.int64]  # voxels of each bright piece that is left out, descending
+    kept: NDArray[np.int64]  # voxels of each dark piece at the box's sides that stays, descending
+
+    @property
+    def words(self) -> str:
+        """Describe the small pieces by number and volume; empty if there are none."""
+        parts = (("bright ones are removed", self.dropped), ("dark ones at the box's sides stay", self.kept))
+        size, unit = self.mask.voxel_volume, f"mm{self.mask.ndim}"
+        words = [
+            f"{what}: {len(voxels)}, {voxels.sum() * size:.3g} {unit} in all, the largest {voxels[0] * size:.3g} {unit}"
+            for what, voxels in parts
+            if len(voxels)
+        ]
+        return f"pieces smaller than 1/100 of the largest: {'; '.join(words)}" if words else ""
+
+    @property
+    def is_suspect(self) -> bool:
+        """True if a bright piece that is left out is too large for noise."""
+        return bool(len(self.dropped) and self.dropped[0] > SUSPECT_VOXELS)
+
+
+def foreground_mask(image: Image, level: float | None = None, labels: Image | None = None) -> Image:
     """Mask of the foreground, 0 and 1.
 
-    The background consists of the voxels at or below the level that are connected by faces to the border of the box,
-    so dark cavities inside remain foreground. Its components with less than 1/100 of the largest one's voxels, such as
-    vessels, bone and gas cut by a face of the box, are foreground. Components of the foreground that are as small,
-    such as noise and tubes, are dropped.
+    Voxels at or below the level that are connected by faces to the box's sides are removed, so dark cavities inside
+    remain. Voxels with a label above 0 always stay. Pieces with less than 1/100 of the largest one's voxels are treated
+    as noise: bright ones without a label are removed, too, and without labels, dark ones at the box's sides stay, such
+    as vessels, bone and gas cut by a face of the box. Pass a label image as `labels`, too, as ``labels=image``.
 
     Parameters
     ----------
@@ -174,6 +201,8 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
         An image brighter than its background.
     level : float, optional
         `background_level` by default.
+    labels : Image, optional
+        Whole numbers from 0, on the image's voxels (see `resample_labels`).
 
     Returns
     -------
@@ -183,7 +212,12 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
     Raises
     ------
     InputError
-        No background (see `background_level`), or no foreground.
+        No background (see `background_level`), no foreground, or labels of another shape.
+
+    Warns
+    -----
+    UserWarning
+        A bright piece of more than 200 voxels is removed.
 
     Examples
     --------
@@ -195,12 +229,33 @@ def foreground_mask(image: Image, level: float | None = None) -> Image:
     >>> dict(result.violated)
     {}
     """
+    if labels is not None and labels.shape != image.shape:
+        raise InputError(f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample them first")
+    front = foreground(image, level, labels)
+    if front.is_suspect:
+        warn(f"{front.words} ({KEEP_PIECES})")
+    return front.mask
+
+
+def foreground(image: Image, level: float | None = None, labels: Image | None = None) -> Foreground:
+    """Find the foreground, and count its small pieces, as `foreground_mask` does."""
     limit = background_level(image) if level is None else float(level)
-    is_outside = _large_pieces(image.data <= limit, at_border=True)
-    is_inside = _large_pieces(~is_outside)
-    fraction, least = float(is_inside.mean()), LEAST_CLASS_FRACTION if level is None else 0.0
+    is_labelled = np.zeros(image.shape, dtype=bool) if labels is None else labels.data > 0
+    dark, sizes = _pieces((image.data <= limit) & ~is_labelled)
+    is_outer = np.zeros(len(sizes), dtype=bool)
+    is_outer[_on_faces(dark)] = True
+    sizes[~is_outer] = 0
+    is_open = sizes >= (1.0 if labels is not None else _least_of(sizes))
+    kept = sizes[~is_open]
+    bright, sizes = _pieces(~is_open[dark])
+    is_kept = sizes >= _least_of(sizes)
+    is_kept[bright[is_labelled]] = True
+    dropped = sizes[~is_kept]
+    is_inside = is_kept[bright]
+    fraction, least = float(is_inside.mean()), LEAST_CLASS_FRACTION if level is None and labels is None else 0.0
     if least < fraction < 1.0 - least:
-        return Image(is_inside, image.affine)
+        mask = Image(is_inside, image.affine)
+        return Foreground(mask, *(np.sort(voxels[voxels > 0])[::-1] for voxels in (dropped, kept)))
     if level is None:
         raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = image.range
@@ -345,13 +400,14 @@ def _on_faces(data: NDArray) -> NDArray:
     return np.concatenate([data.take(end, axis).ravel() for axis in range(data.ndim) for end in (0, -1)])
 
 
-def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[np.bool_]:
-    """Face-connected components not far smaller than the largest; with `at_border`, only those at the border count."""
+def _pieces(is_in: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Face-connected components, numbered from 1, and the number of voxels of each; 0 of the rest."""
     pieces, _ = scipy.ndimage.label(is_in)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
-    if at_border:
-        is_inner = np.ones(len(sizes), dtype=np.bool_)
-        is_inner[_on_faces(pieces)] = False
-        sizes[is_inner] = 0
-    return (sizes >= max(1.0, SMALL_COMPONENT_FRACTION * sizes.max()))[pieces]
+    return pieces, sizes
+
+
+def _least_of(sizes: NDArray[np.int64]) -> float:
+    """The least number of voxels of a component that is not far smaller than the largest."""
+    return max(1.0, SMALL_COMPONENT_FRACTION * float(sizes.max()))

@@ -104,7 +104,10 @@ class RegionOptions:
         Path | None, Option("MASK", "Mesh only this region (0/1, or 0 to 1), with its boundary on the mask's surface.")
     ] = None
     background: Annotated[
-        str | None, Option("VALUE|auto", "Leave out the air: voxels up to VALUE connected to the box's sides.")
+        str | None,
+        Option(
+            "VALUE|auto", "Leave out the air: voxels up to VALUE connected to the box's sides. Labels above 0 stay."
+        ),
     ] = None
     keep_components: Annotated[bool, Option(None, "Keep small components of the mesh that the mask does not have.")] = (
         False

@@ -10,7 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
+from tetopt.contents.align import (
+    KEEP_PIECES,
+    background_level,
+    foreground,
+    resample_contrast,
+    resample_labels,
+    resample_mask,
+)
 from tetopt.contents.content import Content, content, continued
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
@@ -128,10 +135,7 @@ def read_source(
     if options.background is not None:
         is_auto = options.background == "auto"
         level = background_level(image) if is_auto else number_of("`background`", options.background)
-        mask = foreground_mask(image, level)
-        note(
-            f"background: voxels up to {level:g} connected to the box's sides; {mask.data.mean():.1%} of voxels remain"
-        )
+        mask = _foreground(image, level, labels)
     balance = balance_of(options)
     if options.weights is None and is_own:
         whose, used = ("the label image", "labels") if tissues is None else ("one of the tissues", "tissues")
@@ -162,6 +166,16 @@ def read_source(
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+def _foreground(image: Image, level: float, labels: Image | None) -> Image:
+    """Return the mask of the foreground; report what is left out, and what stays."""
+    front = foreground(image, level, labels)
+    remain = f"{front.mask.data.mean():.1%} of voxels remain"
+    note(f"background: voxels up to {level:g} connected to the box's sides are removed; {remain}")
+    if front.words:
+        (warning if front.is_suspect else note)(f"background: {front.words} ({KEEP_PIECES})")
+    return front.mask
 
 
 class ReadLabels(NamedTuple):
