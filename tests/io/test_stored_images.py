@@ -391,7 +391,7 @@ BAD_METADATA = {
         "names of axes: expected x, y and z",
     ),
     "one direction twice": (set_in("axes", axes_of("xyx")), "orientation: expected three different directions"),
-    "unit": (set_in("axes", axes_of("xyz", "second")), "unit: expected one of NGFF's lengths"),
+    "unit": (set_in("axes", axes_of("xyz", "second")), 'unit: expected a length such as "mm" or "um", got "second"'),
     "unit of no text": (set_in("axes", axes_of("xyz", ["mm"])), "unit: expected"),
     "no scale": (set_in(*PLACE, []), "has no scale"),
     "a file of scales": (set_in(*PLACE, [{"type": "scale", "path": "x"}]), "scale: expected 3 numbers, got None"),

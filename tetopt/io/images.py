@@ -28,10 +28,12 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError, warn
 from tetopt.image import Image
 from tetopt.io.apart import DEFLATE_RATIO
+from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.readback import save_checked
+from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import (
     DAMAGED_FILE,
     TOO_LONG,
@@ -59,13 +61,9 @@ MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
 HEAD_BYTES_NIFTI = 1024  # read from a file: the longest header has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
-# mm, longest side of an image's box: a body is shorter than the first; beyond these, the unit is probably not mm.
-LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0
 BEGINNING_BYTES = 512  # of a file: HTML pages begin with a tag, after at most some blanks
 WEB_BEGINNINGS = (b"<!doctype html", b"<html", b"<head", b"<body")
 GZIP_BEGINNING = b"\x1f\x8b"
-# NIfTI's other units of length.
-_MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
 
 
 def load_image(
@@ -145,12 +143,9 @@ def load_image(
             whole = open_zarr(zarr_levels(path, notes)[0], volume)
             image = _part_of_stored(whole, slice_, crop, notes)
         else:
-            whole = image = Image(*_read(path, volume, notes))
-            image = part_of(image, slice_, crop)
+            image = part_of(Image(*_read(path, volume, notes)), slice_, crop)
     except InputError as error:
         raise named_error(path, error) from error
-    if not path.name.lower().endswith(PICTURE_SUFFIXES):  # pixels of pictures are always 1 mm
-        notes += notes_of_size(whole)
     for note in notes:
         warn(f"{path}: {note}")
     low = image.data.min()
@@ -530,9 +525,12 @@ def nibabel_voxels(
         file = _nibabel_file(path)
     notes += [f"nibabel repaired its header ({word}); check its voxel sizes and position" for word in words]
     notes += _notes_of_place(file, head)
-    affine = _affine_in_mm(file)
+    lengths = _units(file, notes)
+    affine = np.array(file.affine, dtype=np.float64)
+    affine[:3] *= 1.0 if lengths is None else lengths[:, None]
+    notes += notes_of_size(file.shape, affine, lengths)
     index = volume_index(file.shape[3:], volume)
-    _check_size(path, file, 0 if volume is None else volume, is_packed)
+    _check_size(path, file, 0 if volume is None else volume, is_packed, notes)
     return file.dataobj, index, affine
 
 
@@ -581,20 +579,11 @@ def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
             return []
         return ["has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's guess"]
     header: Any = file.header
+    notes = notes_of_nifti(header, file.shape)
     if int(header["sform_code"]) or int(header["qform_code"]):
-        return []
+        return notes
     guess = "has no orientation: position and left/right are nibabel's guess"
-    return [f"{guess}; if they matter, convert it again with its sform or qform"]
-
-
-def notes_of_size(image: Image) -> list[str]:
-    """Return a warning if the unit is probably not mm."""
-    steps = np.linalg.norm(image.affine[:-1, :-1], axis=0)
-    longest = float((steps * image.shape).max())
-    if SHORTEST_BOX <= longest <= LONGEST_BOX:
-        return []
-    voxel = " x ".join(f"{step:.4g}" for step in steps)
-    return [f"the longest side of its box is {longest:.4g} mm; are its voxels {voxel} mm, or in another unit?"]
+    return [f"{guess}; if they matter, convert it again with its sform or qform", *notes]
 
 
 def _nibabel_file(path: Path) -> SpatialImage:
@@ -616,7 +605,7 @@ def _nibabel_file(path: Path) -> SpatialImage:
     raise InputError(UNREADABLE_FILE)
 
 
-def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) -> None:
+def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool, notes: list[str]) -> None:
     """Raise InputError unless the file can hold all volumes up to the requested one, before memory is allocated."""
     proxy: Any = file.dataobj
     volume_bytes = math.prod(file.shape[:3]) * proxy.dtype.itemsize
@@ -626,15 +615,17 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
             f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, but the file has {size})"
         )
-    most = proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES
+    whole = proxy.offset + math.prod(file.shape[3:]) * volume_bytes
     if is_packed:
-        _check_gzip(path, most)
-    elif size > most:  # its checksum would cover all of it
-        raise InputError(TOO_LONG.format(most))
+        size = _check_gzip(path, whole + TRAILING_BYTES)
+    elif size > whole + TRAILING_BYTES:  # its checksum would cover all of it
+        raise InputError(TOO_LONG.format(whole + TRAILING_BYTES))
+    if isinstance(file, nibabel.Nifti1Pair):  # MGH has tags there
+        notes += notes_of_rest(size - whole, file.shape, proxy.dtype.itemsize)
 
 
-def _check_gzip(path: Path, most: int) -> None:
-    """Unpack the whole file once, in blocks: nibabel stops before the checksum after the last voxel."""
+def _check_gzip(path: Path, most: int) -> int:
+    """Unpack the whole file once, in blocks, and return its size: nibabel stops before the checksum at its end."""
     n_bytes = 0
     try:
         with gzip.open(path) as stream:
@@ -642,6 +633,7 @@ def _check_gzip(path: Path, most: int) -> None:
                 n_bytes += len(block)
                 if n_bytes > most:
                     raise InputError(TOO_LONG.format(most))
+        return n_bytes
     except (OSError, EOFError, zlib.error) as error:
         raise _of_gzip(error) from error
 
@@ -652,13 +644,17 @@ def _of_gzip(error: Exception) -> InputError:
     return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
 
 
-def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
-    affine = np.array(file.affine, dtype=np.float64)
-    if isinstance(file, nibabel.Nifti1Pair):
-        # A code outside the standard means mm, like 'unknown'.
-        with contextlib.suppress(KeyError):
-            affine[:3] *= _MM_PER_UNIT.get(file.header.get_xyzt_units()[0], 1.0)
-    return affine
+def _units(file: SpatialImage, notes: list[str]) -> NDArray[np.float64] | None:
+    """Return the length of the file's unit, mm, for each axis; None if it states none."""
+    header: Any = file.header
+    if not isinstance(file, nibabel.Nifti1Pair):
+        return None
+    try:
+        unit = header.get_xyzt_units()[0]
+    except KeyError:
+        notes.append(f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm")
+        return None
+    return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units", notes)
 
 
 # Geometry of parts

@@ -33,6 +33,8 @@ READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompress
 class VoxelHeader(NamedTuple):
     """The contents of a header."""
 
+    stated: list[tuple[str, str]]  # fields, in order; those of NRRD in lower case without blanks
+    texts: dict[str, str]  # key:=value pairs of NRRD
     sizes: list[int]
     value_bytes: int  # all voxels
     files: list[str]  # data files; empty if the voxels follow the header
@@ -41,8 +43,8 @@ class VoxelHeader(NamedTuple):
     n_bytes: int  # of the header itself, if voxels follow
 
 
-def checked_header(path: Path) -> tuple[int, int]:
-    """Return the number of bytes of all files of the image, and of all its voxels.
+def checked_header(path: Path) -> tuple[VoxelHeader, int]:
+    """Return the header, and the number of bytes of all files of the image.
 
     Raises
     ------
@@ -50,10 +52,10 @@ def checked_header(path: Path) -> tuple[int, int]:
         Without a leading path: the header cannot be read or declares more than the files contain; a data file is not
         next to the header, or is not a regular file.
     """
-    header = _header(path)
+    header = read_header(path)
     n_bytes = _checked_bytes(path, header)
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1), READ_IN_PARTS)
-    return n_bytes, header.value_bytes
+    return header, n_bytes
 
 
 def _checked_bytes(path: Path, header: VoxelHeader) -> int:
@@ -75,7 +77,7 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
 
 def data_files(path: Path) -> list[Path]:
     """Return the data files of a header, empty if the voxels follow it; InputError for reasons of `checked_header`."""
-    return _data_files(path, _header(path))
+    return _data_files(path, read_header(path))
 
 
 def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
@@ -86,10 +88,11 @@ def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
 
 def header_sizes(path: Path) -> tuple[int, ...]:
     """Return the lengths of the axes in the header; InputError for the reasons of `checked_header` in the header."""
-    return tuple(_header(path).sizes)
+    return tuple(read_header(path).sizes)
 
 
-def _header(path: Path) -> VoxelHeader:
+def read_header(path: Path) -> VoxelHeader:
+    """Return the header of a file; InputError for the reasons of `checked_header` in the header."""
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
     header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
@@ -125,14 +128,14 @@ def _n_axes(text: str) -> int:
 
 
 def _metaimage(head: bytes) -> VoxelHeader:
-    fields: dict[str, str] = {}
+    stated: list[tuple[str, str]] = []
     files: list[str] = []
     lines = head.split(b"\n")
     for number, line in enumerate(lines):
         key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
         if (key and not equals) or ":" in key:  # ITK also ends a key at a colon
             raise InputError(UNREADABLE_FILE)
-        fields[key] = value
+        stated.append((key, value))
         if key == "ElementDataFile":
             rest = [each.decode("latin-1").strip() for each in lines[number + 1 :]]
             if value.upper().startswith("LIST"):
@@ -140,6 +143,7 @@ def _metaimage(head: bytes) -> VoxelHeader:
             elif value.upper() != "LOCAL":
                 files = [value]
             break
+    fields = dict(stated)
     for key in ("NDims", "DimSize", "ElementType", "ElementDataFile"):
         if key not in fields:
             raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
@@ -151,13 +155,15 @@ def _metaimage(head: bytes) -> VoxelHeader:
     is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
     ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
     value_bytes, end = math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]), lines[: number + 1]
-    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1)
+    skip, n_bytes = fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1
+    return VoxelHeader(stated, {}, sizes, value_bytes, files, ratio, skip, n_bytes)
 
 
 def _nrrd(head: bytes) -> VoxelHeader:
     if not head.startswith(b"NRRD"):
         raise InputError(UNREADABLE_FILE)
     fields: dict[str, str] = {}
+    texts: dict[str, str] = {}
     files: list[str] = []
     raw = head.split(b"\n")
     lines = [line.decode("latin-1").rstrip("\r") for line in raw]
@@ -167,11 +173,14 @@ def _nrrd(head: bytes) -> VoxelHeader:
         if not line:
             break
         key, _, value = line.partition(":")
-        if line.startswith("#") or value.startswith("="):  # "key:=value", which is not a field
+        if line.startswith("#"):
             continue
-        key, value = key.strip().lower(), value.strip()
+        if value.startswith("="):  # "key:=value", which is not a field; of bytes in UTF-8
+            texts[key] = value[1:].encode("latin-1").decode("utf-8", "replace")
+            continue
+        key, value = key.strip().lower().replace(" ", ""), value.strip()
         fields[key] = value
-        if key in ("data file", "datafile"):
+        if key == "datafile":
             if value.upper().startswith("LIST"):
                 files += [each.strip() for each in lines[number + 1 :] if each.strip()]
                 break
@@ -187,7 +196,7 @@ def _nrrd(head: bytes) -> VoxelHeader:
             ratio = of_these
     value_bytes, skip = math.prod(sizes) * _value_bytes(fields["type"]), fields.get("byteskip", "0")
     end = len(b"\n".join(raw[: number + 1])) + 1
-    return VoxelHeader(sizes, value_bytes, files, ratio, fields.get("byte skip", skip), end)
+    return VoxelHeader(list(fields.items()), texts, sizes, value_bytes, files, ratio, skip, end)
 
 
 def _value_bytes(kind: str) -> int:

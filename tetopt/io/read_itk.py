@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
+from tetopt.io.contradictions import notes_of_metaimage, notes_of_nrrd, notes_of_rest
 from tetopt.io.itk_headers import checked_header
+from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
@@ -31,16 +34,48 @@ ITK_READERS = {
 # DICOM slices may deviate from an even spacing by this fraction of it, because positions are often rounded.
 _UNEVEN_FRACTION = 0.05
 _SAME_PLACE_MM = 1e-3  # slices closer to each other share one position
+SPATIAL_KINDS = ("domain", "space", "???", "none")  # of NRRD's axes; others are times, colours, vectors
 # In a folder without DICOM files: subfolders searched, files tried in each, and subfolders listed in the message.
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 
 
-def read_itk(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
-    size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
-    data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=value_bytes, library="SimpleITK")
+    if path.suffix.lower() == ".dcm":
+        data, affine = read_apart(_volume_of, path, volume, library="SimpleITK")
+        return data, affine
+    header, size = checked_header(path)
+    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
+    about = notes_of_nrrd(dict(header.stated), header.sizes) if is_nrrd else notes_of_metaimage(header.stated)
+    if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
+        rest = size - header.n_bytes - int(header.skip) - header.value_bytes
+        about += notes_of_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(dict(header.stated), about)
+    data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=header.value_bytes, library="SimpleITK")
+    n = len(affine) - 1
+    affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
+    notes += about + notes_of_size(data.shape, affine, lengths)
     return data, affine
+
+
+def _nrrd_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64] | None:
+    """Return the lengths of units along the world axes, mm; None if there are none."""
+    name, key = ("space units", "spaceunits") if "spaceunits" in fields else ("units", "units")
+    if key not in fields:
+        return None
+    kinds = fields.get("kinds", "").split()
+    words = re.findall(r'"((?:[^"\\]|\\.)*)"', fields[key])
+    if key == "units":  # of the array's axes, which are the world's without a space
+        words = [word for k, word in enumerate(words) if k >= len(kinds) or kinds[k].lower() in SPATIAL_KINDS]
+    if len(words) < 2:
+        raise InputError(f"{name}: expected a unit in quotation marks per axis, got {fields[key][:80]}")
+    return mm_of_axes(words[:3], name, notes)
+
+
+def _metaimage_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64] | None:
+    words = [fields.get("DistanceUnits", "").strip("?")] * 3
+    return mm_of_axes(words, "DistanceUnits", notes)
 
 
 def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:

@@ -21,7 +21,6 @@ from tetopt.io.images import (
     image_files,
     named_error,
     nibabel_voxels,
-    notes_of_size,
     os_errors_named,
 )
 from tetopt.io.itk_headers import HEADED_SUFFIXES
@@ -82,7 +81,6 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     notes: list[str] = []
     try:
         image = _opened(path, volume, notes)
-        notes += notes_of_size(image)
         if crop is not None:
             image = _cropped(image, checked_bounds(image.shape, crop))
         if image.voxels.chunks is not None:

@@ -19,7 +19,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image, checked_affine
+from tetopt.io.contradictions import SAME_SIZE, SAME_VOXELS, sizes_words
 from tetopt.io.text import plain
+from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
 from tetopt.io.zarr_codecs import PACKERS, bounded
 from tetopt.system.budget import check_memory
@@ -36,14 +38,6 @@ MOST_SPARSE = 1000  # chunks per existing chunk: an almost empty image would tak
 PACKED_BYTES, PACKED_VOXEL_BYTES = 2**16, 32
 CHUNK_EDGE = 128  # voxels, in written files: 4 MB of 16 bits, and a part of a mesh reads a few chunks
 MOST_LEVELS = 64  # in a multiscale: more than halving any volume can give
-# NGFF's units of length, with names of UDUNITS-2, in mm.
-MM_PER_LENGTH = {
-    "yoctometer": 1e-21, "zeptometer": 1e-18, "attometer": 1e-15, "femtometer": 1e-12, "picometer": 1e-9,
-    "angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "decimeter": 100.0,
-    "meter": 1e3, "hectometer": 1e5, "kilometer": 1e6, "megameter": 1e9, "gigameter": 1e12, "terameter": 1e15,
-    "petameter": 1e18, "exameter": 1e21, "zettameter": 1e24, "yottameter": 1e27, "inch": 25.4, "foot": 304.8,
-    "yard": 914.4, "mile": 1609344.0, "parsec": 3.0856775814913674e19,
-}  # fmt: skip
 # Direction of an axis in RAS+, by its orientation (NGFF's RFC-4): row of the affine and sign.
 WAYS_OF_BODY = {
     "left-to-right": (0, 1.0), "right-to-left": (0, -1.0), "posterior-to-anterior": (1, 1.0),
@@ -134,8 +128,10 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     levels = [_level(path, each, after, axes, places) for each in datasets]
     own = _own_affine(levels[0].array)
     if own is None:
-        notes += places.notes
+        notes += places.notes + notes_of_size(levels[0].shape, levels[0].affine, places.mm)
         return levels
+    notes += _notes_of_own(own, levels[0].affine)
+    notes += notes_of_size(levels[0].shape, own, np.ones(3))
     # NGFF 0.5 has no rotations: the attribute of the first level places all levels.
     turn = own @ np.linalg.inv(levels[0].affine)
     return [levels[0]._replace(affine=own), *(each._replace(affine=turn @ each.affine) for each in levels[1:])]
@@ -265,6 +261,19 @@ def _own_affine(array: Any) -> NDArray[np.float64] | None:
     return None if affine is None else checked_affine(affine, 3)
 
 
+def _notes_of_own(own: NDArray[np.float64], scaled: NDArray[np.float64]) -> list[str]:
+    """Return a warning if scale and translation, which state no directions, differ from an affine."""
+    sizes = [np.linalg.norm(each[:3, :3], axis=0) for each in (own, scaled)]
+    is_near = np.allclose(own[:3, 3], scaled[:3, 3], atol=SAME_VOXELS * sizes[0].min())
+    if is_near and np.allclose(sizes[0], sizes[1], rtol=SAME_SIZE):
+        return []
+    words = [
+        f"voxels of {sizes_words(size)} mm at ({', '.join(f'{x:.6g}' for x in each[:3, 3])})"
+        for size, each in zip(sizes, (own, scaled), strict=True)
+    ]
+    return [f'its attribute "affine" has {words[0]}, its scale and translation {words[1]}; the first is used, check it']
+
+
 def _node(path: Path) -> Any:
     """Open the array or group in a folder with zarr."""
     zarr = _library()
@@ -382,7 +391,7 @@ class _Places:
                 "images are supported"
             )
         inside = [axes[number] for number in self.space]
-        self.mm = [_mm_of(axis, self.notes) for axis in inside]
+        self.mm = _mm_of(inside, self.notes)
         ways = [WAYS_OF_BODY.get(_orientation(axis)) for axis in inside]
         self.ways = [way for way in ways if way is not None]
         if len(self.ways) < 3:
@@ -401,23 +410,22 @@ class _Places:
         """Return the affine from index to world mm, (4, 4), for a scale and translation in the units of the axes."""
         affine = np.zeros((4, 4))
         affine[3, 3] = 1.0
-        for column, (axis, (row, sign), mm) in enumerate(zip(self.space, self.ways, self.mm, strict=True)):
+        lengths = np.ones(3) if self.mm is None else self.mm
+        for column, (axis, (row, sign), mm) in enumerate(zip(self.space, self.ways, lengths, strict=True)):
             affine[row, column] = sign * mm * scale[axis]
             affine[row, 3] = sign * mm * shift[axis]
         return checked_affine(affine, 3)
 
 
-def _mm_of(axis: dict, notes: list[str]) -> float:
-    """Return the length of an axis's unit, mm."""
-    unit = axis.get("unit")
-    if unit is None:
-        note = "has no unit on its axes: assuming mm"
-        if note not in notes:
-            notes.append(note)
-        return 1.0
-    if not isinstance(unit, str) or unit not in MM_PER_LENGTH:
-        raise _unusable("unit", unit, "one of NGFF's lengths, such as micrometer or millimeter")
-    return MM_PER_LENGTH[unit]
+def _mm_of(axes: list[dict], notes: list[str]) -> NDArray[np.float64] | None:
+    """Return the lengths of the axes' units, mm; None if no axis has one."""
+    units = [axis.get("unit") for axis in axes]
+    for unit in units:
+        if not isinstance(unit, str | None):
+            raise _unusable("unit", unit, "one of NGFF's lengths, such as micrometer or millimeter")
+    if not any(units):
+        notes.append("has no unit on its axes: assuming mm")
+    return mm_of_axes([unit or "" for unit in units], "its OME-Zarr metadata: unit", notes)
 
 
 def _orientation(axis: dict) -> str:

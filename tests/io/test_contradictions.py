@@ -1,0 +1,269 @@
+"""Units of headers, and headers that state two places, sides or sizes: one is used, both are told."""
+
+import json
+import re
+import warnings
+
+import nibabel
+import numpy as np
+import pytest
+from test_images import OBLIQUE, ramp
+
+from tetopt.errors import InputError
+from tetopt.io.images import load_image
+from tetopt.io.units import mm_of_unit
+
+pytest.importorskip("SimpleITK")
+
+VOXELS = np.arange(3 * 4 * 500, dtype=np.uint8)  # 3 x 4 x 500: 10 mm long at 0.02 mm
+LPS = "space: left-posterior-superior\nspace directions: (20,0,0) (0,20,0) (0,0,20)\nspace origin: (100,0,-50)\n"
+
+
+def read(path):
+    """The image and the texts of `load_image`'s warnings, without the path."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        image = load_image(path)
+    return image, [str(each.message).removeprefix(f"{path}: ") for each in caught if each.category is UserWarning]
+
+
+def nrrd(folder, fields, sizes="3 4 500"):
+    n_axes = len(sizes.split())
+    head = f"NRRD0004\ntype: uint8\ndimension: {n_axes}\nsizes: {sizes}\nencoding: raw\n{fields}\n"
+    (folder / "a.nrrd").write_bytes(head.encode() + VOXELS.tobytes())
+    return folder / "a.nrrd"
+
+
+def mha(folder, fields, data=VOXELS):
+    head = f"ObjectType = Image\nNDims = 3\nDimSize = 3 4 500\n{fields}ElementType = MET_UCHAR\n"
+    (folder / "a.mha").write_bytes(f"{head}ElementDataFile = LOCAL\n".encode() + data.tobytes())
+    return folder / "a.mha"
+
+
+pytestmark = pytest.mark.usefixtures("here")
+
+# Units
+
+
+@pytest.mark.parametrize(
+    ("word", "mm"),
+    [("microns", 1e-3), ("um", 1e-3), ("µm", 1e-3), ("\u03bcm", 1e-3), (r"\u00B5m", 1e-3), ("Micrometres", 1e-3),
+     ("mm", 1.0), ("MM", 1.0), ("millimeter", 1.0), ("cm", 10.0), ("m", 1000.0), ("metre", 1000.0), ("nm", 1e-6),
+     ("inches", 25.4), ("feet", 304.8), (" in ", 25.4), ("", None), ("pixels", None), ("Unknown", None)],
+)  # fmt: skip
+def test_words_of_units(word, mm):
+    assert mm_of_unit(word) == mm
+
+
+@pytest.mark.parametrize("word", ["second", "furlong", "s", "Hz", "mm2", "mms m"])
+def test_words_of_no_length_are_refused(word):
+    with pytest.raises(InputError, match=f'unit: expected a length such as "mm" or "um", got "{word}"'):
+        mm_of_unit(word)
+
+
+UNITS_OF_NRRD = {  # fields, voxel edges in mm, first voxel in RAS mm
+    "of a space": (LPS + 'space units: "microns" "microns" "microns"\n', [0.02] * 3, [-0.1, 0.0, -0.05]),
+    "µm": (LPS + 'space units: "µm" "µm" "µm"\n', [0.02] * 3, [-0.1, 0.0, -0.05]),
+    "that differ": (LPS + 'space units: "mm" "mm" "cm"\n', [20.0, 20.0, 200.0], [-100.0, 0.0, -500.0]),
+    "of RAS": (LPS.replace("left-posterior", "right-anterior") + 'space units: "um" "um" "um"\n', [0.02] * 3,
+               [0.1, 0.0, -0.05]),
+    "of axes": ('spacings: 20 20 40\nunits: "um" "um" "um"\n', [0.02, 0.02, 0.04], [0.0, 0.0, 0.0]),
+    "none": (LPS, [20.0] * 3, [-100.0, 0.0, -50.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNITS_OF_NRRD)
+def test_units_of_nrrd(tmp_path, name):
+    fields, steps, corner = UNITS_OF_NRRD[name]
+    image, said = read(nrrd(tmp_path, fields))
+    np.testing.assert_allclose(image.spacing, steps, rtol=1e-12)
+    np.testing.assert_allclose(image.to_world([0, 0, 0]), corner, rtol=1e-12, atol=1e-12)
+    assert ("or in another unit?" in "".join(said)) == (name == "none")  # 10 m long
+    assert len(said) == (name == "none")
+
+
+def test_unit_of_no_length_in_nrrd(tmp_path):
+    with pytest.raises(InputError, match='space units: expected a length such as "mm" or "um", got "furlong"'):
+        load_image(nrrd(tmp_path, LPS + 'space units: "mm" "mm" "furlong"\n'))
+    with pytest.raises(InputError, match="space units: expected a unit in quotation marks per axis, got um um um"):
+        load_image(nrrd(tmp_path, LPS + "space units: um um um\n"))
+    image, said = read(nrrd(tmp_path, LPS + 'space units: "um" "um" ""\n'))
+    assert image.spacing.tolist() == pytest.approx([0.02, 0.02, 20.0])
+    assert said == ['space units: expected a unit of length, got none for axis 2: ""; assuming mm']
+
+
+def test_unit_of_metaimage(tmp_path):
+    image, said = read(mha(tmp_path, "ElementSpacing = 20 20 20\nDistanceUnits = um\n"))
+    assert (image.spacing.tolist(), said) == (pytest.approx([0.02] * 3), [])
+
+
+@pytest.mark.parametrize(("unit", "said"), [("micron", None), ("mm", "0.1 mm, in the unit that"), ("unknown", "or in")])
+def test_small_box_of_a_stated_unit(tmp_path, unit, said):
+    file = nibabel.Nifti1Image(ramp(3, 4, 5), np.diag([0.02 if unit != "micron" else 20.0] * 3 + [1.0]))
+    file.header.set_xyzt_units(unit)
+    nibabel.save(file, tmp_path / "a.nii")
+    image, heard = read(tmp_path / "a.nii")
+    assert image.spacing.tolist() == pytest.approx([0.02] * 3)
+    assert heard == [] if said is None else said in heard[0]
+
+
+# Headers that contradict themselves
+
+
+def nifti(folder, sform, qform, codes=(1, 1), **fields):
+    file = nibabel.Nifti1Image(ramp(3, 4, 5), None)
+    file.header.set_qform(qform, codes[1])
+    file.header.set_sform(sform, codes[0])
+    file.header.set_xyzt_units("mm")
+    file.header["vox_offset"] = 352
+    for name, value in fields.items():
+        file.header[name] = value
+    # Saved by nibabel, a file would get one affine.
+    (folder / "a.nii").write_bytes(file.header.binaryblock + bytes(4) + ramp(3, 4, 5).tobytes(order="F"))
+    return folder / "a.nii"
+
+
+def moved(by, affine=None):
+    out = np.diag([1.0, 2.0, 3.0, 1.0]) if affine is None else affine.copy()
+    out[:3, 3] += by
+    return out
+
+
+STEPS = moved([0, 0, 0])
+TURN = np.diag([np.cos(0.1), np.cos(0.1), 1.0, 1.0]) + np.sin(0.1) * np.eye(4)[[1, 0, 2, 3]] * [[-1], [1], [0], [0]]
+PLACES = {  # sform, qform, codes, what is told; None for nothing
+    "moved": (STEPS, moved([0, 0, 7.5]), (1, 1), "place it differently, by up to 7.5 mm; the sform is used"),
+    "half a voxel": (STEPS, moved([0.5, 0, 0]), (1, 1), "by up to 0.5 mm"),
+    "mirrored": (STEPS, np.diag([-1.0, 2.0, 3.0, 1.0]), (1, 1), "are mirror images of each other (left/right)"),
+    "sizes": (STEPS, np.diag([1.0, 2.0, 3.3, 1.0]), (2, 2), "have voxels of 1 x 2 x 3 and 1 x 2 x 3.3 mm"),
+    "turned": (STEPS, TURN @ STEPS, (1, 1), "place it differently, by up to 0.6"),
+    "spaces": (moved([5, 0, 0]), STEPS, (4, 1), "the sform (MNI space) and the qform (scanner space) place it"),
+    "equal": (STEPS, STEPS, (1, 1), None),
+    "rounded": (moved(1e-3), STEPS, (1, 1), None),
+    "half a turn": (moved(0, np.diag([-1.0, -2.0, 3.0, 1.0])), np.diag([-1.0, -2.0, 3.0, 1.0]), (4, 1), None),
+    "no qform": (STEPS, moved([50, 0, 0]), (1, 0), None),
+    "no sform": (moved([50, 0, 0]), STEPS, (0, 1), None),
+    "pixdim": (
+        STEPS,
+        np.diag([1.0, 2.0, 4.0, 1.0]),
+        (1, 0),
+        "sform has voxels of 1 x 2 x 3 mm, its pixdim 1 x 2 x 4",
+    ),
+    "neither": (STEPS, STEPS, (0, 0), "sform has code 0 (unset) and is ignored"),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_two_places_of_nifti(tmp_path, name):
+    sform, qform, codes, told = PLACES[name]
+    image, said = read(nifti(tmp_path, sform, qform, codes))
+    assert said == [] if told is None else told in said[-1]
+    if codes[0]:
+        np.testing.assert_array_equal(image.affine, sform.astype(np.float32))
+
+
+def test_shear_that_a_qform_cannot_have(tmp_path):
+    file = nibabel.Nifti1Image(np.zeros((200, 200, 90), np.uint8), OBLIQUE)
+    file.header.set_qform(OBLIQUE, 1, strip_shears=True)
+    file.header.set_sform(OBLIQUE, 1)
+    nibabel.save(file, tmp_path / "a.nii.gz")
+    assert not any("sform" in line for line in read(tmp_path / "a.nii.gz")[1])
+
+
+def test_sizes_of_nifti(tmp_path):
+    path = nifti(tmp_path, STEPS, STEPS, dim=[3, 3, 4, 5, 7, 1, 1, 1])
+    assert read(path)[1] == ["its dim lists [3, 4, 5, 7, 1, 1, 1] voxels, but only 3 axes (dim[0]) are read"]
+    path = nifti(tmp_path, STEPS, STEPS, dim=[3, 3, 4, 4, 1, 1, 1, 1])
+    assert read(path)[1] == [
+        "its header declares 3 x 4 x 4 voxels, but the file has 24 more bytes after them; check its sizes"
+    ]
+
+
+TURNED = "0 1 0 0 0 1 1 0 0"
+METAIMAGES = {  # fields, what is told, voxel edges, RAS direction of the first axis
+    "sizes": ("ElementSize = 2 2 2\nElementSpacing = 1 1 3\n", "voxel sizes, ElementSpacing = 1 1 3 and ElementSize",
+              [1, 1, 3], [-1, 0, 0]),
+    "size alone": ("ElementSize = 2 2 3\n", None, [2, 2, 3], [-1, 0, 0]),
+    "no size": ("Comment = x\n", "has no voxel size: assuming 1 mm", [1, 1, 1], [-1, 0, 0]),
+    "positions": ("Position = 2 2 2\nOffset = 1 1 1\n", "two positions, Offset = 1 1 1 and Position", None, None),
+    "directions": (f"Orientation = 1 0 0 0 1 0 0 0 1\nTransformMatrix = {TURNED}\n", "two directions, TransformMatrix",
+                   None, [0, -1, 0]),
+    "twice": ("ElementSpacing = 2 2 2\nElementSpacing = 1 1 3\n", "ElementSpacing twice, 2 2 2 and 1 1 3", [1, 1, 3],
+              None),
+    "letters": ("AnatomicalOrientation = LAI\n", "AnatomicalOrientation LAI contradicts its directions, LxPxS", None,
+                [-1, 0, 0]),
+    "letters of ITK": ("AnatomicalOrientation = RAI\n", None, None, [-1, 0, 0]),
+    "letters of MetaIO": (f"AnatomicalOrientation = PSL\nTransformMatrix = {TURNED}\n", None, None, [0, -1, 0]),
+    "letters unset": ("AnatomicalOrientation = ???\n", None, None, None),
+    "lengths": ("TransformMatrix = 2 0 0 0 2 0 0 0 1\n", "directions have lengths 2 x 2 x 1", [2, 2, 1], None),
+    "equal": ("Position = 1 1 1\nOffset = 1 1 1.0\n", None, None, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METAIMAGES)
+def test_two_statements_of_metaimage(tmp_path, name):
+    fields, told, steps, first = METAIMAGES[name]
+    has_size = "Element" in fields or name == "no size"
+    image, said = read(mha(tmp_path, fields if has_size else f"{fields}ElementSpacing = 1 1 1\n"))
+    assert said == [] if told is None else told in said[0], said
+    if steps is not None:
+        assert image.spacing.tolist() == pytest.approx(steps)
+    if first is not None:
+        np.testing.assert_allclose(image.affine[:3, 0] / image.spacing[0], first)
+
+
+def test_more_voxels_than_metaimage_declares(tmp_path):
+    path = mha(tmp_path, "ElementSpacing = 1 1 1\n", data=np.zeros(3 * 4 * 501, np.uint8))
+    assert "declares 3 x 4 x 500 voxels, but the file has 12 more bytes" in read(path)[1][0]
+
+
+NRRDS = {
+    "sizes": (
+        "spacings: 1 1 3\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n",
+        "spacings are 1 x 1 x 3, but 2 x 2 x 2 by",
+    ),
+    "equal": ("spacings: 2 2 2\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n", None),
+    "no size": ("", "has no voxel size: assuming 1 mm"),
+    "space": (
+        LPS.replace("left-posterior-superior", "3D-right-handed"),
+        'its space "3D-right-handed" does not tell',
+    ),
+    "no space": (LPS.replace("space: left-posterior-superior", "space dimension: 3"), "it has no space, which"),
+}
+
+
+@pytest.mark.parametrize("name", NRRDS)
+def test_two_statements_of_nrrd(tmp_path, name):
+    fields, told = NRRDS[name]
+    said = read(nrrd(tmp_path, fields))[1]
+    assert said == [] if told is None else told in said[0]
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [(LPS + "spacings: 1 1 1\n", 'both "spacedirections" .* and "spacings" (1 1 1)'),
+     (LPS + "space dimension: 3\n", 'both "space" (left-posterior-superior) and "spacedimension" (3)'),
+     ("space: LPS\nspacings: 1 1 1\n", 'has the space "LPS" but no "space directions"')],
+)  # fmt: skip
+def test_statements_that_nrrd_excludes(tmp_path, fields, told):
+    with pytest.raises(InputError, match=".*".join(re.escape(part) for part in told.split(".*"))):
+        load_image(nrrd(tmp_path, fields))
+
+
+def test_affine_of_zarr_beside_its_scale(tmp_path):
+    pytest.importorskip("zarr")
+    from tetopt.io.images import save_image
+
+    save_image(tmp_path / "a.zarr", load_image(nifti(tmp_path, moved([0, 0, 7]), STEPS, (1, 0))))
+    assert read(tmp_path / "a.zarr")[1] == []
+    file = tmp_path / "a.zarr" / "zarr.json"
+    table = json.loads(file.read_text())
+    scale = table["attributes"]["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]
+    scale["scale"] = [1.0, 2.0, 6.0]
+    file.write_text(json.dumps(table))
+    image, said = read(tmp_path / "a.zarr")
+    assert image.spacing.tolist() == [1.0, 2.0, 3.0]
+    assert said == [
+        'its attribute "affine" has voxels of 1 x 2 x 3 mm at (0, 0, 7), its scale and translation voxels of 1 x 2 x 6 '
+        "mm at (0, 0, 7); the first is used, check it"
+    ]
