@@ -1,10 +1,14 @@
 """The mesh: what is accepted, what is kept, and every message."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from meshes import ALL_SMALL, BAD_TETS, REGULAR_TET, SQUARE, single
 
-from tetopt import InputError, Mesh
+import tetopt
+from tetopt import Image, InputError, Mesh
 
 TRIANGLE = [[0, 0], [1, 0], [0, 1]]
 
@@ -45,6 +49,47 @@ def test_arrays_are_copied_contiguous_and_read_only():
         mesh.cells[0, 0] = 1
     with pytest.raises(AttributeError):
         mesh.points = points
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda noun: pickle.loads(pickle.dumps(noun))])
+def test_copies_of_nouns_are_locked_and_equal(again):
+    middles = 0.5 * (np.array(TRIANGLE)[[0, 0, 1]] + np.array(TRIANGLE)[[1, 2, 2]])
+    phantom = tetopt.load_phantom("sphere")
+    for noun, names in (
+        (Mesh(TRIANGLE, [[0, 1, 2]], middles), ("points", "cells", "midpoints")),
+        (Image(np.arange(6.0).reshape(2, 3), np.diag([2.0, 3.0, 1.0])), ("data", "affine")),
+        (Image.stored(np.arange(24, dtype=np.int16).reshape(2, 3, 4)), ("affine",)),
+        (phantom, ("size_mm", "axes")),
+        (phantom.shapes[0], ("center", "half")),
+    ):
+        other = again(noun)
+        assert repr(other) == repr(noun)
+        for name in names:
+            np.testing.assert_array_equal(getattr(other, name), getattr(noun, name))
+            assert not getattr(other, name).flags.writeable
+    assert again(Image.stored(np.zeros((2, 3, 4)))).is_stored
+
+
+def test_an_unpickled_mesh_is_checked():
+    kind, (points, cells, _) = Mesh(TRIANGLE, [[0, 1, 2]]).__reduce__()
+    with pytest.raises(InputError, match=r"indices in 0\.\.2, got 1\.\.3"):
+        kind(points, cells + 1, None)
+
+
+def test_masked_values_are_refused():
+    """Numpy would take the numbers behind the mask; a mask that hides nothing is fine."""
+    hidden = np.ma.masked_equal(np.arange(24.0).reshape(2, 3, 4), 5.0)
+    with pytest.raises(InputError, match=r"^image data: got 1 masked values; .*filled"):
+        Image(hidden)
+    with pytest.raises(InputError, match=r"^affine: got 1 masked values"):
+        Image(np.zeros((2, 2)), np.ma.masked_equal([[2.0, 0, 0], [0, 3.0, 0], [0, 0, 1.0]], 3.0))
+    with pytest.raises(InputError, match=r"^mesh points: got 2 masked values"):
+        Mesh(np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), [[0, 1, 2]])
+    with pytest.raises(InputError, match=r"^mesh cells: got 1 masked values"):
+        Mesh(TRIANGLE, np.ma.masked_equal([[0, 1, 2]], 1))
+    with pytest.raises(InputError, match=r"^quality: points: got 2 masked values"):
+        tetopt.quality(np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), np.array([[0, 1, 2]]))
+    assert Image(np.ma.masked_equal(np.zeros((2, 3)), 1.0)).data.shape == (2, 3)
 
 
 def test_unused_nodes_are_allowed():

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.interop import notebook
 from tetopt.system.budget import check_memory
+from tetopt.system.public import unmasked
 
 SINGULAR_DETERMINANT = 1e-6  # determinant of the axes' directions, below which they do not span the space
 # Ratio of a voxel's longest to its shortest extent, shear included: slices of 10 mm with pixels of 0.1 mm have 100. At
@@ -50,8 +51,8 @@ class Image:
     Raises
     ------
     InputError
-        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or has
-        the wrong size.
+        Wrong number of axes, an empty axis, complex, RGB, masked or non-finite data, or an affine that is singular or
+        has the wrong size.
 
     See Also
     --------
@@ -72,6 +73,10 @@ class Image:
         checked = _checked_data(data)
         affine = checked_affine(np.eye(checked.ndim + 1) if affine is None else affine, checked.ndim)
         vars(self).update(voxels=checked, affine=affine, data=checked)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Check and lock the arrays of a copy, or of an unpickled image, again: pickle keeps neither."""
+        return Image.stored if self.is_stored else Image, (self.voxels, self.affine)
 
     @classmethod
     def stored(cls, voxels: Any, affine: ArrayLike | None = None) -> Image:
@@ -338,7 +343,9 @@ def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> ND
 def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
     """Return a read-only float32 or float64 C-ordered copy of `data`; raise InputError if it cannot be an image."""
     try:
-        data = np.asarray(data)
+        data = unmasked("image data", data)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:  # rows of different lengths, or a nibabel image
         raise InputError(f"image data: expected an array of numbers, got {type(data).__name__} ({error})") from error
     check_kind(data.dtype)
@@ -403,7 +410,9 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
 def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return a read-only copy of the affine; raise InputError unless it is (n+1, n+1), finite, homogeneous, regular."""
     try:
-        affine = np.array(affine, dtype=np.float64)
+        affine = np.array(unmasked("affine", affine), dtype=np.float64)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"affine: expected a ({n + 1}, {n + 1}) array of numbers, got {affine!r}") from error
     if affine.shape != (n + 1, n + 1):

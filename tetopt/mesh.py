@@ -14,6 +14,7 @@ from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
+from tetopt.system.public import checked_simplices, unmasked
 
 if TYPE_CHECKING:
     import meshio
@@ -41,7 +42,7 @@ class Mesh:
     Raises
     ------
     InputError
-        Wrong shapes, non-finite points, no cells, indices out of range, or a cell that is flat or inverted
+        Wrong shapes, non-finite points, masked values, no cells, indices out of range, or flat or inverted cells
         (`tetopt.geometry.simplex.oriented` turns inverted ones).
 
     See Also
@@ -62,24 +63,8 @@ class Mesh:
     midpoints: NDArray[np.float64] | None
 
     def __init__(self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None) -> None:
-        try:
-            points = np.array(points, dtype=np.float64, order="C")
-            cells = np.asarray(cells)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"mesh: expected arrays of numbers for points and cells ({error})") from error
-        if points.ndim != 2 or points.shape[1] not in (2, 3):
-            raise InputError(f"mesh points: expected shape (N, 2) or (N, 3), got {points.shape}")
+        points, cells = checked_simplices("mesh", points, cells)
         n = points.shape[1]
-        if cells.ndim != 2 or cells.shape[1] != n + 1 or len(cells) == 0:
-            raise InputError(f"mesh cells: expected shape (M, {n + 1}) with M > 0, got {cells.shape}")
-        if not np.issubdtype(cells.dtype, np.integer):
-            raise InputError(f"mesh cells: expected integers, got {cells.dtype}")
-        cells = np.array(cells, dtype=np.int64, order="C")
-        if not np.isfinite(points).all():
-            first = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise InputError(f"mesh points: expected finite coordinates, but node {first} is {points[first].tolist()}")
-        if cells.min() < 0 or cells.max() >= len(points):
-            raise InputError(f"mesh cells: expected indices in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
         v = volumes(points, cells)
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)
@@ -92,6 +77,10 @@ class Mesh:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "cells", cells)
         object.__setattr__(self, "midpoints", None if midpoints is None else _checked_midpoints(midpoints, cells, n))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Check and lock the arrays of a copy, or of an unpickled mesh, again: pickle keeps neither."""
+        return Mesh, (self.points, self.cells, self.midpoints)
 
     @property
     def ndim(self) -> int:
@@ -362,7 +351,9 @@ class Mesh:
 
 def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -> NDArray[np.float64]:
     try:
-        places = np.array(midpoints, dtype=np.float64, order="C")
+        places = np.array(unmasked("mesh midpoints", midpoints), dtype=np.float64, order="C")
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"mesh midpoints: expected an array of numbers ({error})") from error
     expected = (len(numbered_edges(cells)[0]), n)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides, upright_axis, world_axes
@@ -25,13 +26,29 @@ def test_whole_numbers_are_compared_exactly():
     assert is_on_sides(places, sides, tolerance=0)[:, 0].tolist() == [[True, False], [False, False], [False, True]]
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_upright_axis_stands_for_the_last_world_axis(seed):
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("seed", range(20))
+def test_axes_are_assigned_by_the_largest_sum_of_cosines(seed, n):
     rng = np.random.default_rng(seed)
+    affine = np.eye(n + 1)
+    affine[:n, :n] = Rotation.random(random_state=seed).as_matrix()[:n, :n] + rng.uniform(-0.3, 0.3, (n, n))
+    axes = world_axes(affine)
+    assert sorted(axes) == list(range(n))
+    assert axes[upright_axis(affine)] == n - 1
+    cosines = np.abs(affine[:n, :n] / np.linalg.norm(affine[:n, :n], axis=0))
+    world, index = linear_sum_assignment(cosines, maximize=True)
+    assert [axes[each] for each in index] == world.tolist()
+
+
+def test_the_axis_that_rises_most_need_not_be_the_upright_one():
+    """The first axis rises by 0.8 and the third by 0.65, but the third fits no other direction as well."""
     affine = np.eye(4)
-    affine[:3, :3] = Rotation.random(random_state=seed).as_matrix() @ np.diag(rng.uniform(0.5, 3.0, 3))
-    axes, up = world_axes(affine), upright_axis(affine)
-    assert sorted(axes) == [0, 1, 2]
-    assert axes[up] == 2
-    rises = np.abs(affine[2, :3]) / np.linalg.norm(affine[:3, :3], axis=0)
-    assert rises[up] == rises.max()
+    affine[:3, :3] = [[0.6, 0.0, 0.1], [0.0, 1.0, 0.75], [0.8, 0.0, 0.65]]
+    assert (world_axes(affine), upright_axis(affine)) == ((0, 1, 2), 2)
+
+
+def test_equally_good_assignments_keep_the_order_of_the_axes():
+    for axis in range(3):
+        affine = np.eye(4)
+        affine[:3, :3] = Rotation.from_euler("xyz"[axis], 45, degrees=True).as_matrix()
+        assert world_axes(affine) == (0, 1, 2)

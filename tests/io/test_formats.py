@@ -29,6 +29,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.sets import Sets
 
 pytestmark = pytest.mark.usefixtures("here")
+CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 1, 2, 3]])
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -352,3 +353,101 @@ def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="the file reads back differently"):
         save_model(path, model)
     assert path.read_bytes() == b"old"
+
+
+def bad_models():
+    """What does not fit the sample's mesh, by the words of the refusal."""
+    model = sample_model()
+    n_cells, n_points, table = len(model.mesh.cells), len(model.mesh.points), model.materials
+    ones, rows = np.ones(n_cells), model.sets.facets["left"]
+    for values in (
+        ones[1:], np.append(ones, 1.0), 3.0, np.array(3.0), None, ones[:, None][:, :0], ones * 1j,
+        np.full(n_cells, "a"), np.full(n_cells, None), np.zeros(n_cells, "M8[s]"), [10**30] * n_cells,
+        [[1, 2], *[[1]] * (n_cells - 1)], np.ma.masked_less(np.arange(n_cells), 2),
+    ):  # fmt: skip
+        yield "cell_data: 'a': ", model._replace(cell_data={"a": values})
+    yield "cell_data: expected strings as names", model._replace(cell_data={3: ones})
+    yield "cell_data: expected a dict", model._replace(cell_data=[ones])
+    for values in (np.ones(n_points - 1), np.ones(n_points + 1), np.full(n_points, "a"), 3.0):
+        yield "point.data: ", model._replace(point_data={"a": values})
+    for values in (
+        rows + np.array([n_cells, 0]), rows - np.array([n_cells, 0]), rows + np.array([0, 4]), rows[:, 0],
+        rows[::-1], rows[[0, 0]], rows[:0],
+        rows.astype(float), rows == 1, np.column_stack([rows, rows[:, 1]]), 3,
+    ):  # fmt: skip
+        yield "set 'a': expected facets", model._replace(sets=Sets({"a": values}, {}), loads=())
+    for values in ([], [n_cells], [-1], [2, 1], [1, 1], ones == 1.0, [0.5], [[1]], 3, "a"):
+        yield "set 'a': expected cells", model._replace(sets=Sets({}, {"a": values}), loads=())
+    yield "load: ", model._replace(sets=Sets({}, {}))
+    for of_cell in (table.of_cell[1:], table.of_cell + 1, table.of_cell - 1, table.of_cell.astype(float)):
+        yield "materials: ", model._replace(materials=table._replace(of_cell=of_cell))
+    for name in ("young", "nu", "density"):
+        yield (
+            f"materials: expected a finite {name}",
+            model._replace(materials=table._replace(**{name: np.nan * table.young})),
+        )
+    yield "rows of moduli", model._replace(node_young=np.ones(n_points - 1))
+    yield "about: ", model._replace(about={"a": ones})
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_data_that_do_not_fit_leave_the_old_file(suffix, tmp_path):
+    """In every format, also in those that do not hold them: no file that cannot be read, and no cut rows."""
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+    for words, model in bad_models():
+        with pytest.raises(InputError, match=words) as caught:
+            save_model(path, model)
+        assert "\n" not in str(caught.value)
+        assert [each.name for each in tmp_path.iterdir()] == [path.name]
+        assert path.read_bytes() == b"old"
+
+
+@pytest.mark.filterwarnings("ignore:.*linear elements")
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".feb"])
+def test_integers_are_kept_or_refused(suffix, tmp_path):
+    model = sample_model()
+    for value in (2**53, 2**53 + 1, 2**63 + 1):
+        data = {"a": np.full(len(model.mesh.cells), value, dtype=np.uint64)}
+        if value > (2**63 if suffix in (".vtu", ".vtkhdf", ".xdmf") else 2**53):
+            with pytest.raises(InputError, match=f"expected integers up to .* in 'a', got {value}"):
+                save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
+        else:
+            save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
+            if suffix in (".vtu", ".vtk", ".vtkhdf", ".msh"):
+                assert int(tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data["a"][0]) == value
+
+
+@pytest.mark.filterwarnings("ignore:.*linear elements")
+def test_lists_and_tables_are_written_by_all(tmp_path):
+    """A list is an array, also for sets; rows of more than one axis are flattened."""
+    model = sample_model()
+    cells = len(model.mesh.cells)
+    data = {"a": list(range(cells)), "b": np.ones((cells, 3, 3)), "c": np.arange(cells) > 3}
+    model = model._replace(cell_data=data, sets=Sets({"x": [[0, 1]]}, {"y": [3, 5]}), loads=())
+    for suffix in FORMATS:
+        save_model(tmp_path / f"a{suffix}", model)
+    back = tetopt.load_mesh(tmp_path / "a.vtu")
+    assert back.cell_data["a"].tolist() == data["a"]
+    assert back.cell_data["b"].shape == (cells, 9)
+    assert (back.sets.facets["x"].tolist(), back.sets.cells["y"].tolist()) == ([[0, 1]], [3, 5])
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
+def test_a_surface_that_does_not_fit_leaves_the_old_file(suffix, tmp_path):
+    surface = extract_surface(*CORNER, [0])
+    (tmp_path / f"a{suffix}").write_bytes(b"old")
+    bad = [
+        {"surface": surface._replace(triangles=surface.triangles + 1)},
+        {"surface": surface._replace(triangles=surface.triangles.astype(float))},
+        {"surface": surface._replace(points=surface.points * np.nan)},
+        {"surface": surface._replace(points=surface.points[:, :2])},
+        {"space": "xyz"},
+    ]
+    values = np.arange(4)
+    labels = (values[1:], values[:, None], values + 2**31, values * 0.5, values.astype(str), 3)
+    bad += [{"labels": {"a": each}} for each in labels if suffix != ".stl"]
+    for options in bad:
+        with pytest.raises(InputError, match="expected"):
+            save_surface(tmp_path / f"a{suffix}", **{"surface": surface} | options)
+        assert (tmp_path / f"a{suffix}").read_bytes() == b"old"

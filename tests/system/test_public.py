@@ -216,3 +216,45 @@ def test_a_warning_names_the_line_of_who_called(tmp_path):
         with pytest.warns(UserWarning, match=r"\w: ") as caught:
             call()
         assert {Path(each.filename) for each in caught} == {Path(__file__)}, name
+
+
+@pytest.mark.parametrize(
+    ("points", "cells", "message"),
+    [
+        (np.where(MESH.points == 4.0, np.nan, MESH.points), MESH.cells, "points: expected finite coordinates"),
+        (np.where(MESH.points == 4.0, np.inf, MESH.points), MESH.cells, "points: expected finite coordinates"),
+        (MESH.points, MESH.cells + 1, r"cells: expected indices in 0\.\.3, got 1\.\.4"),
+        (MESH.points, MESH.cells - 1, r"cells: expected indices in 0\.\.3, got -1\.\.2"),
+        (MESH.points, MESH.cells.astype(float), "cells: expected integers, got float64"),
+        (MESH.points, MESH.cells == 1, "cells: expected integers, got bool"),
+        (MESH.points, MESH.cells[:0], r"cells: expected shape \(M, 4\) with M > 0, got \(0, 4\)"),
+        (MESH.points, MESH.cells[:, :3], r"cells: expected shape \(M, 4\)"),
+        (MESH.points[:, :1], MESH.cells, r"points: expected shape \(N, 2\) or \(N, 3\), got \(4, 1\)"),
+        (MESH.points[:0], MESH.cells, r"cells: expected indices in 0\.\.-1"),
+    ],
+)
+def test_points_and_cells_that_do_not_fit_are_refused(points, cells, message):
+    for name in ("quality", "E_G", "extract_surface"):
+        chosen = {"chosen": [True]} if name == "extract_surface" else {}
+        with pytest.raises(tetopt.InputError, match=f"^{name}: {message}") as caught:
+            getattr(tetopt, name)(points=points, cells=cells, **chosen)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int16, np.uint64, np.float16, np.float32, np.longdouble])
+def test_numbers_of_any_width_are_the_same_number(kind):
+    """As 100 * 100 overflows 8 bits."""
+    plain = tetopt.lattice_mesh(IMAGE, nodes=100)
+    assert np.array_equal(tetopt.lattice_mesh(IMAGE, nodes=kind(100)).cells, plain.cells)
+    tree = tetopt.octree_mesh(IMAGE, 120, tetopt.Sizes(gradation=1.0))
+    other = tetopt.octree_mesh(IMAGE, nodes=kind(120), sizes=tetopt.Sizes(gradation=kind(1)))
+    assert np.array_equal(other.points, tree.points)
+    assert tetopt.lattice_mesh(IMAGE, blocks=[kind(2), kind(3), kind(4)]).cells.shape == (288, 4)
+    job = tetopt.Job(images="a.nii", output="a.vtu", nodes=kind(100), max_seconds=kind(2))
+    assert (type(job.nodes), type(job.max_seconds)) == (int, float)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, np.float32(0.5), np.array(7)])
+def test_what_is_no_whole_number_is_refused(value):
+    with pytest.raises(tetopt.InputError, match="nodes: expected a whole number"):
+        tetopt.lattice_mesh(IMAGE, nodes=value)

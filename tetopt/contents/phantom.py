@@ -69,6 +69,14 @@ _SHAPE_KEYS = {
 }
 
 
+def _lock(record: Any, state: dict[str, Any]) -> None:
+    """Set the fields of a copied or unpickled record, with read-only arrays: pickle does not keep that."""
+    for value in state.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+    vars(record).update(state)
+
+
 @dataclass(frozen=True, eq=False)
 class Shape:
     """One painted shape: an ellipsoid, a box or a layer.
@@ -106,6 +114,9 @@ class Shape:
     intensity: float
     label: int
     name: str = ""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _lock(self, state)
 
 
 def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
@@ -186,6 +197,9 @@ class Phantom:
     blur_mm: float = 0.0
     noise_sd: float = 0.0
     seed: int = 0
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _lock(self, state)
 
     @property
     def ndim(self) -> int:

@@ -41,19 +41,20 @@ def facets_on_sides(
 
 
 def upright_axis(affine: NDArray[np.float64]) -> int:
-    """The index axis nearest to the last world axis: z in 3-D, from inferior to superior, and y in 2-D."""
-    return int(np.argmax(_cosines(affine)[-1]))
+    """The index axis that corresponds to the last world axis: z in 3-D, from inferior to superior, and y in 2-D."""
+    return world_axes(affine).index(len(affine) - 2)
 
 
 def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
-    """The world axis that corresponds to each index axis; each occurs once.
+    """The world axis that corresponds to each index axis, by the largest sum of cosines; each occurs once."""
+    cosines = _cosines(affine)
 
-    The last world axis belongs to `upright_axis`; the others are assigned for the best overall alignment.
-    """
-    cosines, up = _cosines(affine), upright_axis(affine)
-    n = len(cosines)
-    orders = [order for order in permutations(range(n)) if order[up] == n - 1]
-    return max(orders, key=lambda order: float(np.prod(cosines[list(order), range(n)])))
+    def alignment(order: tuple[int, ...]) -> tuple[float, float]:
+        chosen = cosines[list(order), range(len(order))]
+        # Rounded, so that the first order wins where several are as good, as in a turn by 45 degrees.
+        return round(float(chosen.sum()), 9), round(float(chosen.prod()), 9)
+
+    return max(permutations(range(len(cosines))), key=alignment)
 
 
 def _cosines(affine: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.interop.notebook import in_kernel
 from tetopt.system.extras import install_hint
+from tetopt.system.public import unmasked
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
@@ -237,18 +238,22 @@ def from_skfem(mesh: Any) -> Simplices:
 # --- to others
 
 
-def checked_fields(what: str, fields: Fields | None, n_rows: int) -> dict[str, NDArray]:
-    """Return arrays of numbers by name; InputError unless each has `n_rows` rows."""
+def checked_fields(what: str, fields: Fields | None, n_rows: int | None = None) -> dict[str, NDArray]:
+    """Return arrays of numbers by name; InputError unless each has `n_rows` rows, by default any number."""
     if not isinstance(fields, Mapping | None):
         raise InputError(f"{what}: expected a dict of arrays by name, got {type(fields).__name__}")
     arrays: dict[str, NDArray] = {}
     for name, rows in (fields or {}).items():
-        line = f"{what}: {name!a}: expected an array of numbers with {n_rows} rows"
+        line = f"{what}: {name!a}: expected an array of numbers"
+        line += "" if n_rows is None else f" with {n_rows} rows"
         try:
-            values = np.asarray(rows)
+            values = unmasked(f"{what}: {name!a}", rows)
+        except InputError:
+            raise
         except (TypeError, ValueError) as error:  # rows of different lengths
             raise InputError(f"{line}, got {type(rows).__name__} ({error})") from error
-        if values.dtype.kind not in "biuf" or values.ndim == 0 or len(values) != n_rows or values.size == 0:
+        is_long = values.ndim > 0 and n_rows in (None, len(values))
+        if values.dtype.kind not in "biuf" or not is_long or values.size == 0:
             raise InputError(f"{line}, got {values.dtype} of shape {values.shape}")
         if not isinstance(name, str):
             raise InputError(f"{what}: expected strings as names, got {name!a}")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError, warn
+from tetopt.interop.conversions import checked_fields
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
@@ -22,8 +25,11 @@ from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
+from tetopt.model.fields import node_field
+from tetopt.model.loads import known_set
+from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
-from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
+from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets, is_set
 
 
 class Format(NamedTuple):
@@ -52,6 +58,8 @@ FORMATS = {
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
+EXACT_INTEGERS = (".vtu", ".vtkhdf", ".xdmf")  # formats of 64-bit integers; others convert large ones to float64
+MOST_OF_FLOATS = 2**53  # float64 holds all integers up to this one
 # How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
 SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
 
@@ -145,7 +153,8 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Raises
     ------
     InputError
-        The suffix is unknown; the format does not support the model; names of sets are not supported by all formats.
+        The suffix is unknown; the format does not support the model; names of sets are not supported by all formats;
+        data, sets or materials do not fit the mesh. Nothing is written then.
     OSError
         For the reasons of `tetopt.io.readback.save_checked`.
 
@@ -194,11 +203,11 @@ def save_mesh(
         Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     mesh : Mesh
         Points in world coordinates, mm.
-    cell_data : dict of arrays, optional
-        By name, one row per cell.
+    cell_data : dict of arrays of numbers, optional
+        By name, one row per cell; rows of more than one axis are flattened.
     about : dict, optional
         Strings for the file's header, by name.
-    point_data : dict of arrays, optional
+    point_data : dict of arrays of numbers, optional
         By name, one row per mesh point, or per node of order 2.
     order : {1, 2}
         2: quadratic cells, with straight edges unless the mesh has midpoints.
@@ -246,7 +255,74 @@ def _ready(path: Path, model: Model, space: str, units: str) -> Model:
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
-    return _named(path, in_units(in_space(model, space), units))
+    return _named(path, in_units(in_space(_checked(path, model), space), units))
+
+
+def _checked(path: Path, model: Model) -> Model:
+    """Return the model with arrays of numbers for all data; InputError for data that do not fit the mesh or format.
+
+    Models are records that anyone can build, and no writer checks them.
+    """
+    mesh, n_cells = model.mesh, len(model.mesh.cells)
+    cell_data = checked_fields(f"{path}: cell_data", model.cell_data, n_cells)
+    point_data = {
+        name: node_field(values, mesh, model.order)
+        for name, values in checked_fields(f"{path}: point_data", model.point_data).items()
+    }
+    for name, values in (cell_data | point_data).items():
+        most = np.iinfo(np.int64).max if path.suffix.lower() in EXACT_INTEGERS else MOST_OF_FLOATS
+        if values.dtype.kind in "iu" and (values.max() > most or values.min() < -most):
+            raise InputError(f"{path}: expected integers up to {most} in {plain(name)!r}, got {values.max()}; use .vtu")
+        if path.suffix.lower() == ".feb" and not np.isfinite(values).all():
+            raise InputError(f"{path}: expected finite numbers in {plain(name)!r}; remove this field, or use .vtu")
+    try:
+        json.dumps(dict(model.about))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: about: expected strings, or values in JSON's types, by name ({error})") from error
+    facets = _checked_sets(path, model.sets.facets, (n_cells, mesh.ndim + 1), "facets as rows (cell, opposite node)")
+    cells = _checked_sets(path, model.sets.cells, (n_cells,), "cells by number")
+    for load in model.loads:
+        if load.set_name:
+            known_set(load.set_name, model.sets)
+    if model.materials is not None:
+        _check_materials(path, model.materials, n_cells)
+    for moduli, n_rows in ((model.node_young, len(mesh.points)), (model.gauss_young, n_cells)):
+        if moduli is not None and (len(moduli) != n_rows or not (np.isfinite(moduli) & (moduli > 0.0)).all()):
+            raise InputError(f"{path}: expected {n_rows} rows of moduli above 0 that vary within cells")
+    return model._replace(cell_data=cell_data, point_data=point_data, sets=Sets(facets, cells))
+
+
+def _checked_sets(
+    path: Path, sets: Mapping[str, ArrayLike], ends: tuple[int, ...], what: str
+) -> dict[str, NDArray[np.int64]]:
+    """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to below `ends`."""
+    arrays = {}
+    for name, rows in sets.items():
+        values = np.asarray(rows)
+        if (
+            values.ndim != len(ends)
+            or values.shape[1:] not in ((), (2,))
+            or not len(values)
+            or not is_set(values, ends)
+        ):
+            raise InputError(
+                f"{path}: set {plain(str(name))!r}: expected {what}, distinct integers from 0 to {ends[0] - 1} in "
+                f"ascending order, got {values.dtype} of shape {values.shape}"
+            )
+        arrays[name] = values.astype(np.int64)
+    return arrays
+
+
+def _check_materials(path: Path, table: Materials, n_cells: int) -> None:
+    """Raise InputError unless each cell has one of the materials, whose numbers are finite."""
+    of_cell, n_kinds = np.asarray(table.of_cell), len(table.young)
+    is_index = of_cell.dtype.kind in "iu" and of_cell.shape == (n_cells,)
+    if not is_index or of_cell.min() < 0 or of_cell.max() >= n_kinds:
+        raise InputError(f"{path}: materials: expected a number from 0 to {n_kinds - 1} for each of {n_cells} cells")
+    for name in ("young", "nu", "density"):
+        values = getattr(table, name)
+        if values is not None and (np.shape(values) != (n_kinds,) or not np.isfinite(values).all()):
+            raise InputError(f"{path}: materials: expected a finite {name} for each of {n_kinds} materials")
 
 
 def _named(path: Path, model: Model) -> Model:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, extract_surface
+from tetopt.interop.conversions import checked_fields
 from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
-from tetopt.model.model import Model, half_turn
+from tetopt.model.model import SPACES, Model, half_turn
 from tetopt.model.sets import MOST_LETTERS, SET_NAME
+from tetopt.system.public import checked_simplices
 
 if TYPE_CHECKING:
     import pyvista
@@ -71,7 +73,7 @@ def save_surface(
     Raises
     ------
     InputError
-        The suffix is unknown; labels are given for an STL file, which cannot store them.
+        The suffix is unknown; labels are given for an STL file, which cannot store them, or do not fit the triangles.
 
     Examples
     --------
@@ -92,10 +94,27 @@ def save_surface(
             f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, "
             f'got "{plain(odd[0])}"; rename them'
         )
+    surface, labels = _checked(path, surface, labels)
+    if space not in SPACES:
+        raise InputError(f"space: expected {' or '.join(SPACES)}, got {plain(space)}")
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
-    whole = writers[path.suffix.lower()](surface, about, space, labels or {})
+    whole = writers[path.suffix.lower()](surface, about, space, labels)
     save_checked(path, whole)
+
+
+def _checked(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surface, Labels]:
+    """Return the surface and labels as arrays; InputError for triangles or labels that do not fit."""
+    points, triangles = checked_simplices(f"{path}: surface", surface.points, surface.triangles, 3)
+    if points.shape[1] != 3:
+        raise InputError(f"{path}: expected points in space, got shape {points.shape}")
+    arrays, range_ = checked_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)
+    for name, values in arrays.items():
+        if values.ndim != 1 or values.dtype.kind not in "iu" or values.min() < range_.min or values.max() > range_.max:
+            raise InputError(
+                f"{path}: labels: {name}: expected a 32-bit integer for each of {len(triangles)} triangles"
+            )
+    return surface._replace(points=points, triangles=triangles), arrays
 
 
 def boundary_stl(model: Model) -> bytes:

@@ -34,7 +34,7 @@ from tetopt.model.fields import is_stress
 from tetopt.model.file import text_in
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, elements, grid_fields
-from tetopt.model.sets import SET_NAME, Box, Sets
+from tetopt.model.sets import SET_NAME, Box, Sets, is_set
 from tetopt.system.incoming import json_of
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str
         prefix, name = key[: key.index(":") + 1], key.partition(":")[2]
         ends = (len(mesh.cells), mesh.ndim + 1) if prefix == FACETS_PREFIX else (len(mesh.cells),)
         is_free = name.lower() not in {each.lower() for part in sets for each in part}
-        if not SET_NAME.fullmatch(name) or not is_free or not _is_set(field_data[key], ends):
+        if not SET_NAME.fullmatch(name) or not is_free or not is_set(field_data[key], ends):
             unfit.append(name)
         elif prefix == FACETS_PREFIX:
             sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
@@ -169,15 +169,6 @@ def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str
             sets.cells[name] = field_data[key].ravel().astype(np.int64)
     words = "dropped sets with invalid or repeated names, or without ascending cells or facets"
     return sets, (f"{words}: {', '.join(unfit)}",) if unfit else ()
-
-
-def _is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
-    """Return whether values are ascending rows of integers from 0 to below `ends`."""
-    try:
-        numbers = np.ravel_multi_index(tuple(values.reshape(-1, len(ends)).T), ends)
-    except (TypeError, ValueError):
-        return False
-    return bool((np.diff(numbers) > 0).all())
 
 
 def _checksum(mesh: Mesh) -> str:

@@ -14,6 +14,8 @@ from textwrap import wrap
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
+import numpy as np
+
 from tetopt.errors import InputError
 from tetopt.job.options import JobOptions, SizeOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
@@ -197,6 +199,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if value is None and is_optional:
         return None
     own = get_args(kind)[0] if is_optional else kind
+    value = value.item() if isinstance(value, np.number) else value  # whose comparisons may overflow
     if get_origin(own) is list:
         (of_each,) = get_args(own)
         many = [value] if isinstance(value, str | Path) else value

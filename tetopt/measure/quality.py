@@ -208,7 +208,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     Raises
     ------
     InputError
-        Points or cells that are not 2-D arrays of numbers.
+        Points or cells that are not 2-D arrays of numbers, points that are not finite, or cells that do not index them.
 
     See Also
     --------

@@ -97,6 +97,17 @@ def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
 
 
+def is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
+    """Return whether values are ascending rows of integers from 0 to below `ends`."""
+    if values.dtype.kind not in "iu":
+        return False
+    try:
+        numbers = np.ravel_multi_index(tuple(values.reshape(-1, len(ends)).T), ends)
+    except (TypeError, ValueError):
+        return False
+    return bool((np.diff(numbers) > 0).all())
+
+
 def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the outward area vectors of facets (K, 2), (K, n), mm2 (in 2-D mm)."""
     corners = mesh.points[facet_triples(mesh.cells, rows)]
@@ -130,8 +141,9 @@ def standard_sets(
     ----------
     mesh : Mesh
     box : Box, optional
-        The box of the meshed image; each face is named after the nearest world axis: "left" is the side of smaller x in
-        RAS+. By default the axis-aligned bounding box of the mesh.
+        The box of the meshed image; each pair of faces is named after the world axis of its index axis
+        (`tetopt.geometry.box.world_axes`): "left" is the side of smaller x in RAS+. By default the axis-aligned
+        bounding box of the mesh.
     labels : (M,) integers, optional
         Label of each cell.
     names : mapping of label to text, optional

@@ -124,8 +124,7 @@ def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
         return Outcome(None, {}, peak, [], limit, "limit")
     if code == 0 and result.is_file():
         (mesh, seconds, notes, labels), own_peak = pickle.loads(result.read_bytes())
-        # Checked, with locked arrays again, as pickle keeps neither.
-        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None, labels=labels)
+        return Outcome(mesh, seconds, max(peak, own_peak), notes, None, labels=labels)
     reason: Reason = "error"
     if (words := signal_words(code)) is not None:
         reason, failure = "crash", f"crashed: {words}"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 import tetopt
 from tetopt.errors import InputError
@@ -47,10 +48,68 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def call(*args: Any, **options: Any) -> Any:
-        check_arguments(function, signature.bind(*args, **options).arguments)
-        return function(*args, **options)
+        bound = signature.bind(*args, **options)
+        check_arguments(function, bound.arguments)
+        for name, value in bound.arguments.items():
+            annotation = str(signature.parameters[name].annotation)
+            is_whole = re.search(r"\bint\b", annotation) is not None and "float" not in annotation
+            bound.arguments[name] = _with_plain_numbers(value, is_whole)
+        return function(*bound.args, **bound.kwargs)
 
     return call
+
+
+def unmasked(what: str, values: ArrayLike) -> NDArray:
+    """Return values as an array; InputError for masked ones, whose hidden numbers numpy would use."""
+    if isinstance(values, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(values).sum())):
+        raise InputError(f"{what}: got {n_masked} masked values; replace them by numbers first, as by array.filled(0)")
+    return np.asarray(values)
+
+
+def checked_simplices(
+    what: str, points: ArrayLike, cells: ArrayLike, n_corners: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return copies of points (N, n) and of the cells between them, (M, n+1) or (M, n_corners).
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, non-finite points, no cells, or indices that are not integers or out of range.
+    """
+    try:
+        places = np.array(unmasked(f"{what} points", points), order="C")
+        places = places.astype(None if places.dtype.kind == "c" else np.float64, copy=False)
+        nodes = unmasked(f"{what} cells", cells)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what}: expected arrays of numbers for points and cells ({error})") from error
+    if places.ndim != 2 or places.shape[1] not in (2, 3) or places.dtype.kind == "c":
+        got = f"{places.dtype} of shape {places.shape}" if places.dtype.kind == "c" else places.shape
+        raise InputError(f"{what} points: expected shape (N, 2) or (N, 3), got {got}")
+    width = n_corners or places.shape[1] + 1
+    if nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
+        raise InputError(f"{what} cells: expected shape (M, {width}) with M > 0, got {nodes.shape}")
+    if not np.issubdtype(nodes.dtype, np.integer):
+        raise InputError(f"{what} cells: expected integers, got {nodes.dtype}")
+    if not np.isfinite(places).all():
+        first = int(np.flatnonzero(~np.isfinite(places).all(axis=1))[0])
+        raise InputError(f"{what} points: expected finite coordinates, but node {first} is {places[first].tolist()}")
+    if nodes.min() < 0 or nodes.max() >= len(places):
+        raise InputError(f"{what} cells: expected indices in 0..{len(places) - 1}, got {nodes.min()}..{nodes.max()}")
+    return places, np.array(nodes, dtype=np.int64, order="C")
+
+
+def _with_plain_numbers(value: Any, is_whole: bool) -> Any:
+    """Convert numpy's numbers, also in records, lists and options, to Python's: sums of 8 or 16 bits would overflow."""
+    if isinstance(value, dict):
+        return {key: _with_plain_numbers(each, False) for key, each in value.items()}
+    if isinstance(value, tuple | list) and any(isinstance(each, np.number | float) for each in value):
+        plain = [_with_plain_numbers(each, is_whole) for each in value]
+        return value._make(plain) if hasattr(value, "_make") else type(value)(plain)
+    if isinstance(value, np.integer) or (is_whole and isinstance(value, float | np.floating) and value.is_integer()):
+        return int(value)
+    return float(value) if isinstance(value, np.floating) else value
 
 
 def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
@@ -64,11 +123,14 @@ def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> 
         if value is not parameter.default and parameter.kind is not parameter.VAR_KEYWORD:
             names = inspect.unwrap(function).__globals__  # not those of a decorator's module
             _check(f"{function.__name__}: {name}", str(parameter.annotation), value, names)
+    if arguments.keys() >= {"points", "cells"}:
+        checked_simplices(f"{function.__name__}:", arguments["points"], arguments["cells"])
 
 
 def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> None:
     """Raise InputError unless `value` has one of the types between the annotation's bars, or one of them is unknown."""
     kinds = re.split(r" \| (?![^\[]*\])", annotation)
+    unmasked(what, value) if isinstance(value, np.ma.MaskedArray) else None
     answers = [_is_of(kind, value, names) for kind in kinds]
     if True in answers or None in answers:
         if "Sizes" in kinds and isinstance(value, tuple):  # a record whose constructor checks nothing
