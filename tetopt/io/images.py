@@ -31,7 +31,8 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
-from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
+from tetopt.io.read_dicom import DICOM_SUFFIX, read_dicom
+from tetopt.io.read_itk import ITK_READERS, read_itk
 from tetopt.io.readback import save_checked
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import (
@@ -76,14 +77,15 @@ def load_image(
     """Read an image from a file, or from a folder of Zarr or of DICOM slices, in RAS+ millimetres.
 
     The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra ``tetopt[itk]``)
-    reads NRRD, MetaImage and DICOM; Pillow reads 2-D pictures; zarr (the extra ``tetopt[blocks]``) reads OME-Zarr and
-    Zarr arrays, and only the requested part; `tetopt.io.stored_images.open_stored` describes their placement. Axes of
-    length 1 beyond the third are dropped.
+    reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads 2-D pictures; zarr
+    (``tetopt[blocks]``) reads OME-Zarr and Zarr arrays, and only the requested part;
+    `tetopt.io.stored_images.open_stored` describes their placement. Axes of length 1 beyond the third are dropped.
 
     NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS coordinates are converted to
-    RAS. The slice axis of a DICOM series is determined from the positions of its first and last slice, so that the
-    shear of a tilted gantry is kept. A picture has 1 mm pixels, index (row, column), world x to the right and y up,
-    and y = 0 at the centres of its bottom row.
+    RAS. The slices of a DICOM series, and the frames of a DICOM file, are sorted and placed by their own positions, so
+    that the shear of a tilted gantry is kept; each is rescaled as it states. A DICOM segmentation gives the numbers of
+    its segments, 0 elsewhere, in slices from its first to its last frame. A picture has 1 mm pixels, index (row,
+    column), world x to the right and y up, and y = 0 at the centres of its bottom row.
 
     Parameters
     ----------
@@ -107,7 +109,8 @@ def load_image(
     ------
     InputError
         ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
-        SimpleITK is needed and not installed; a folder has no DICOM series, several, or uneven slices; `open_stored`
+        a library is needed and not installed; a folder has no DICOM series or several; DICOM slices or frames are not
+        parallel, evenly spaced and one per position, or do not state where they lie; `open_stored`
         rejects a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
         invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
 
@@ -449,7 +452,7 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
     """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to `notes`."""
     with os_errors_named():
         if path.is_dir():
-            return read_dicom_folder(path, volume)
+            return read_dicom(path, volume, notes)
     name = check_beginning(path)
     for suffix, read in READERS.items():
         if name.endswith(suffix):
@@ -511,6 +514,7 @@ def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDA
 READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArray[np.float64]]]] = {
     **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
     **dict.fromkeys(ITK_READERS, read_itk),
+    DICOM_SUFFIX: read_dicom,
     **dict.fromkeys(PICTURE_SUFFIXES, read_picture),
 }
 

@@ -46,7 +46,7 @@ class Option(NamedTuple):
     is_argument: bool = False
 
 
-IMAGE_FILES = "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM folder, or a 2-D picture."
+IMAGE_FILES = "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM file or folder, or a 2-D picture."
 JsonOption = Annotated[Path | None, Option("FILE", "Write every number here.", "json")]
 ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
 AVERAGE_OPTION = Option(

@@ -1,0 +1,372 @@
+"""DICOM to images: frames lie where they say, whatever their order, file or kind; or are refused for the true reason.
+
+Files are made by pydicom, segmentations by highdicom, which is also the oracle for them.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from tetopt.errors import InputError
+from tetopt.io import read_dicom
+from tetopt.io.images import load_image
+
+pydicom = pytest.importorskip("pydicom")
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset  # noqa: E402
+
+CT, ENHANCED_CT, MR = "1.2.840.10008.5.1.4.1.1.2", "1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.4"
+EXPLICIT = "1.2.840.10008.1.2.1"
+AXES = np.array([[0.8, 0.6, 0.0], [-0.36, 0.48, 0.8]])  # of rows and columns: oblique
+NORMAL = np.cross(*AXES)
+AXIAL = [1, 0, 0, 0, 1, 0]
+ORIGIN, BETWEEN_ROWS, BETWEEN_COLUMNS, STEP = np.array([10.0, -20.0, 30.0]), 0.5, 0.75, 3.0
+RAMP = np.arange(6 * 4 * 5, dtype=np.int16).reshape(6, 4, 5)  # slices, rows, columns: every voxel another value
+
+
+@pytest.fixture(autouse=True)
+def in_place(monkeypatch, request):
+    """Files are read in this process, but for tests of the child: it takes a second."""
+    if "child" not in request.fixturenames:
+        monkeypatch.setattr(read_dicom, "read_apart", lambda read, path, *rest, **_: read(str(path), *rest))
+
+
+@pytest.fixture
+def child():
+    """Files are read in a child process."""
+
+
+def tagged(**tags):
+    data = Dataset()
+    for name, value in tags.items():
+        setattr(data, name, value)
+    return data
+
+
+def group(name, **tags):
+    """A functional group: a sequence of one item."""
+    return {f"{name}Sequence": [tagged(**tags)]}
+
+
+def file_of(kind, pixels, **tags):
+    """A file of 16-bit pixels (rows, columns), or (frames, rows, columns)."""
+    rows, columns = pixels.shape[-2:]
+    data = tagged(
+        SOPClassUID=kind, SOPInstanceUID=pydicom.uid.generate_uid(), SeriesInstanceUID="1.2.3", Rows=rows,
+        Columns=columns, SamplesPerPixel=1, PhotometricInterpretation="MONOCHROME2", BitsAllocated=16, BitsStored=16,
+        HighBit=15, PixelRepresentation=1, PixelData=np.ascontiguousarray(pixels, "<i2").tobytes(), **tags,
+    )  # fmt: skip
+    if pixels.ndim == 3:
+        data.NumberOfFrames = len(pixels)
+    return data
+
+
+def saved(path, data, syntax=EXPLICIT):
+    data.file_meta = FileMetaDataset()
+    data.file_meta.MediaStorageSOPClassUID = data.SOPClassUID
+    data.file_meta.MediaStorageSOPInstanceUID = data.get("SOPInstanceUID") or "1.2.9"
+    data.file_meta.TransferSyntaxUID = syntax
+    pydicom.dcmwrite(path, data, enforce_file_format=True)
+    return path
+
+
+def places(n=6, step=STEP * NORMAL):
+    return ORIGIN + np.arange(n)[:, None] * step
+
+
+def enhanced(frames, where, *, own=None, axes=AXES, **measures):
+    """An Enhanced CT of frames at these places; `own` are further functional groups of each frame."""
+    measures = {"PixelSpacing": [BETWEEN_ROWS, BETWEEN_COLUMNS], "SpacingBetweenSlices": STEP} | measures
+    data = file_of(ENHANCED_CT, frames)
+    shared = group("PlaneOrientation", ImageOrientationPatient=axes.ravel().tolist())
+    data.SharedFunctionalGroupsSequence = [tagged(**shared | group("PixelMeasures", **measures))]
+    data.PerFrameFunctionalGroupsSequence = [
+        tagged(
+            **group("PlanePosition", ImagePositionPatient=place.round(9).tolist()), **({} if own is None else own[k])
+        )
+        for k, place in enumerate(where)
+    ]
+    return data
+
+
+def slices_of(folder, pixels=RAMP, where=None, kind=CT, **tags):
+    """A series of single slices, named in another order than they lie."""
+    folder.mkdir(exist_ok=True)
+    tags = {"ImageOrientationPatient": AXES.ravel().tolist(), "PixelSpacing": [BETWEEN_ROWS, BETWEEN_COLUMNS]} | tags
+    for k, place in enumerate(places(len(pixels)) if where is None else where):
+        data = file_of(kind, pixels[k], ImagePositionPatient=place.round(9).tolist(), **tags)
+        saved(folder / f"s{(k * 7) % 11}.dcm", data)
+    return folder
+
+
+def affine_of(step=STEP * NORMAL):
+    affine = np.eye(4)
+    affine[:3] = np.column_stack([AXES[0] * BETWEEN_COLUMNS, AXES[1] * BETWEEN_ROWS, step, ORIGIN])
+    return np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
+
+
+def assert_placed(image, pixels=RAMP, affine=None):
+    np.testing.assert_array_equal(image.data, pixels.T)
+    np.testing.assert_allclose(image.affine, affine_of() if affine is None else affine, rtol=0, atol=1e-7)
+
+
+def assert_refused(path, match, **options):
+    with pytest.raises(InputError, match=match) as caught:
+        load_image(path, **options)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ")
+    assert "\n" not in said
+    return said
+
+
+ORDER = np.array([3, 0, 5, 1, 4, 2])
+
+
+def test_frames_in_any_order(tmp_path, child):
+    """The reader sorts them; rows and columns have spacings of their own, and the world is oblique."""
+    assert_placed(load_image(saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER]))))
+
+
+def test_frames_of_a_tilted_gantry_keep_their_shear(tmp_path):
+    step = STEP * NORMAL + 0.8 * AXES[1]
+    path = saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places(step=step)[ORDER]))
+    assert_placed(load_image(path), affine=affine_of(step))
+
+
+def test_several_files_of_one_series_are_one_volume(tmp_path):
+    """Files of many frames and of one, whose frames interleave (a concatenation)."""
+    saved(tmp_path / "b.dcm", enhanced(RAMP[[4, 0, 2]], places()[[4, 0, 2]]))
+    saved(tmp_path / "a.dcm", enhanced(RAMP[[1, 5]], places()[[1, 5]]))
+    saved(tmp_path / "c.dcm", enhanced(RAMP[3:4], places()[3:4]))
+    assert_placed(load_image(tmp_path))
+    assert_refused(tmp_path / "a.dcm", "volume from 0 to 0", volume=1)
+    saved(tmp_path / "again.dcm", enhanced(RAMP[3:4], places()[3:4]))
+    assert_refused(tmp_path, "7 slices of this DICOM series have 6 positions: it has several volumes")
+
+
+def turned(k):
+    own = [{}] * 6
+    own[k] = group("PlaneOrientation", ImageOrientationPatient=AXIAL)
+    return own
+
+
+SQUARE = group("PixelMeasures", PixelSpacing=[1, 1])
+
+
+def of_times(*times):
+    return [group("FrameContent", TemporalPositionIndex=time) for time in times]
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (lambda: enhanced(RAMP, places(7)[[0, 1, 2, 3, 6, 5]]), "a step of 6 mm between slices 3 and 4"),
+        (lambda: enhanced(RAMP, places()[[0, 1, 2, 3, 4, 4]]), "6 slices of this DICOM series have 5 positions"),
+        (lambda: enhanced(RAMP, places(step=AXES[0])), "beside each other"),
+        (lambda: enhanced(RAMP, places(), own=turned(2)), "not parallel .*frame 3 of the file"),
+        (lambda: enhanced(RAMP, places(), own=[*[{}] * 5, SQUARE]), "frame 6 .*different sizes"),
+        (lambda: enhanced(RAMP, places()[:5]), "6 frames, but states where 5 lie"),
+        (lambda: enhanced(RAMP, places(), axes=np.ones((2, 3))), "orthogonal"),
+        (lambda: enhanced(RAMP, places(), own=of_times(1, 2, 1, 2, 1, 2)), "2 volumes"),
+    ],
+    ids=["missing", "double", "beside", "turned", "pixels", "fewer", "axes", "times"],
+)  # fmt: skip
+def test_frames_that_are_no_volume(tmp_path, data, match):
+    """The faults that a series of slices is refused for."""
+    assert_refused(saved(tmp_path / "a.dcm", data()), match)
+
+
+def test_a_volume_of_several_is_chosen(tmp_path):
+    """By stack and time; or by another dimension, such as the echo, where frames have one position."""
+    both = np.concatenate([RAMP, RAMP[::-1] + 500])
+    where = np.concatenate([places(), places()[::-1]])
+    path = saved(tmp_path / "t.dcm", enhanced(both, where, own=of_times(*[2] * 6, *[1] * 6)))
+    assert_placed(load_image(path, volume=1))
+    assert_placed(load_image(path, volume=0), RAMP + 500)
+    own = [group("FrameContent", DimensionIndexValues=[k % 6 + 1, 1 + k // 6]) for k in range(12)]
+    data = enhanced(both, where, own=own)
+    data.DimensionIndexSequence = [tagged(DimensionIndexPointer=tag) for tag in (0x00200032, 0x00189082)]
+    assert_placed(load_image(saved(tmp_path / "e.dcm", data), volume=1), RAMP + 500)
+
+
+def test_each_frame_has_its_own_scale(tmp_path):
+    scales = [(1, 0), (0.5, 3), (2, -1024), (1, 0), (1.25, 0), (3, 7)]
+    own = [group("PixelValueTransformation", RescaleSlope=a, RescaleIntercept=b) for a, b in scales]
+    path = saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER], own=[own[k] for k in ORDER]))
+    assert_placed(load_image(path), np.array([a * plane + b for (a, b), plane in zip(scales, RAMP, strict=True)]))
+
+
+def test_slices_have_their_own_scales(tmp_path):
+    """As PET has; SimpleITK converts all to the first one's type, which may have no fractions."""
+    for k in range(6):
+        slices_of(tmp_path / "d", RAMP[k:][:1], places()[k:][:1], RescaleSlope=1 + k / 4, RescaleIntercept=-k)
+        (tmp_path / "d" / "s0.dcm").rename(tmp_path / "d" / f"k{k}.dcm")
+    k = np.arange(6)[:, None, None]
+    assert_placed(load_image(tmp_path / "d"), RAMP * (1 + k / 4) - k)
+
+
+def test_contradicting_distance_is_told(tmp_path):
+    path = saved(tmp_path / "a.dcm", enhanced(RAMP, places(), SpacingBetweenSlices=1))
+    with pytest.warns(UserWarning, match="3 mm apart by their positions, which are used; SpacingBetweenSlices is 1 mm"):
+        assert_placed(load_image(path))
+
+
+# --------------------------------------------------------------------------------------------------
+# Files of many frames without functional groups
+
+
+def stack(kind, **tags):
+    where = {"ImagePositionPatient": ORIGIN.tolist(), "ImageOrientationPatient": AXES.ravel().tolist()}
+    return file_of(kind, RAMP, PixelSpacing=[BETWEEN_ROWS, BETWEEN_COLUMNS], **where | tags)
+
+
+def test_dose_is_placed_by_its_offsets(tmp_path):
+    dose = "1.2.840.10008.5.1.4.1.1.481.2"
+    offsets = (STEP * np.arange(6)).tolist()
+    data = stack(dose, GridFrameOffsetVector=offsets[::-1], DoseGridScaling="0.25")
+    data.GridFrameOffsetVector = [0.0] + [-each for each in offsets[1:]]  # downwards
+    image = load_image(saved(tmp_path / "a.dcm", data))
+    affine = affine_of()
+    affine[:3, 3] -= 5 * affine[:3, 2]
+    assert_placed(image, 0.25 * RAMP[::-1], affine)
+    data = stack(dose, ImageOrientationPatient=AXIAL, GridFrameOffsetVector=[30.0 + each for each in offsets])
+    assert load_image(saved(tmp_path / "b.dcm", data)).to_world([0, 0, 5]) == pytest.approx([-10, 20, 45])
+    data.GridFrameOffsetVector = [each + 5.0 for each in offsets]
+    assert_refused(saved(tmp_path / "c.dcm", data), "GridFrameOffsetVector that is not of its position")
+
+
+def test_distance_that_a_file_states_is_used(tmp_path):
+    """With its sign, as nuclear medicine has it; and told."""
+    nm = stack("1.2.840.10008.5.1.4.1.1.20", SpacingBetweenSlices=-STEP, FrameIncrementPointer=0x00540080)
+    nm.SliceVector = [1, 2, 3, 4, 5, 6]
+    where = {each: nm[each].value for each in ("ImagePositionPatient", "ImageOrientationPatient")}
+    nm.DetectorInformationSequence = [tagged(**where)]
+    del nm.ImagePositionPatient, nm.ImageOrientationPatient
+    affine = affine_of()
+    affine[:3, 3] -= 5 * affine[:3, 2]
+    with pytest.warns(UserWarning, match="-3 mm apart along the slices' normal, as SpacingBetweenSlices states"):
+        assert_placed(load_image(saved(tmp_path / "a.dcm", nm)), RAMP[::-1], affine)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {"SpacingBetweenSlices": 0},
+        {"SpacingBetweenSlices": STEP, "FrameIncrementPointer": 0x00181063},  # a time
+        {"SpacingBetweenSlices": STEP, "ImagePositionPatient": None},
+    ],
+)
+def test_frames_that_lie_nowhere(tmp_path, tags):
+    assert_refused(
+        saved(tmp_path / "a.dcm", stack("1.2.840.10008.5.1.4.1.1.7.3", **tags)), "does not state where its 6"
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# One slice, and files that are no volumes
+
+
+def test_one_slice_has_the_thickness_that_it_states(tmp_path):
+    for tags, expected in ({"SliceThickness": 5}, 5), ({"SpacingBetweenSlices": 4, "SliceThickness": 5}, 4):
+        path = slices_of(tmp_path / "d", RAMP[:1], **tags) / "s0.dcm"
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert_placed(load_image(path), RAMP[:1], affine_of(expected * NORMAL))
+    path = slices_of(tmp_path / "d", RAMP[:1]) / "s0.dcm"
+    with pytest.warns(UserWarning, match="no thickness: 1 mm is assumed"):
+        assert_placed(load_image(path), RAMP[:1], affine_of(NORMAL))
+
+
+def test_a_picture_without_place(tmp_path):
+    path = saved(tmp_path / "a.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[0]))
+    with pytest.warns(UserWarning, match="no size of pixels: 1 mm") as caught:
+        np.testing.assert_array_equal(load_image(path).affine, np.diag([-1.0, -1.0, 1.0, 1.0]))
+    assert any("no position" in str(each.message) for each in caught)
+    saved(tmp_path / "b.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[1]))
+    assert_refused(tmp_path, r"DICOM file a\.dcm does not state where it lies")
+
+
+def test_a_localizer_of_another_size_is_named(tmp_path):
+    folder = slices_of(tmp_path / "d")
+    saved(
+        folder / "loc.dcm",
+        file_of(CT, np.zeros((9, 8)), ImagePositionPatient=[0, 0, 0], ImageOrientationPatient=AXIAL),
+    )
+    said = assert_refused(folder, r"the DICOM file loc\.dcm has 8 x 9 pixels, and 6 others of its series have 5 x 4")
+    assert "damaged" not in said
+
+
+def without_voxels(kind="1.2.840.10008.5.1.4.1.1.481.3", **tags):
+    return tagged(SOPClassUID=kind, SOPInstanceUID="1.2.7", SeriesInstanceUID="1.2.77", **tags)
+
+
+def changed(**tags):
+    data = file_of(CT, RAMP[0])
+    for name, value in tags.items():
+        setattr(data, name, value)
+    return data
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (without_voxels(ROIContourSequence=[]), "RT Structure Set Storage: contours, no voxels; convert them"),
+        (without_voxels("1.2.840.10008.5.1.4.1.1.88.11"), "Basic Text SR Storage, without voxels"),
+        (without_voxels("1.2.840.10008.1.3.10", DirectoryRecordSequence=[]), "DICOMDIR, a list of files"),
+        (without_voxels(CT, Rows=4, Columns=5), "has no pixel data"),
+        (changed(SamplesPerPixel=3), "3 numbers per voxel"),
+        (changed(PhotometricInterpretation="PALETTE COLOR"), "colours from a palette"),
+        (changed(ImageType=["ORIGINAL", "PRIMARY", "M", "MOSAIC"]), "is a mosaic"),
+        (changed(ImageOrientationPatient=[1, 0, 0]), "expected 6 finite numbers for its ImageOrientationPatient"),
+        (changed(Rows=400), "declares 1 x 400 x 5 voxels"),
+        (changed(NumberOfFrames=10**9), "declares 1000000000 x 4 x 5 voxels"),
+        (changed(Rows=0), "declares 1 x 0 x 5 voxels"),
+    ],
+    ids=lambda value: value[:12] if isinstance(value, str) else "",
+)
+def test_true_reasons(tmp_path, data, match):
+    said = assert_refused(saved(tmp_path / "a.dcm", data), match)
+    assert ("damaged" in said) == ("declares" in said)
+
+
+def test_numbers_that_are_none(tmp_path):
+    path = saved(tmp_path / "a.dcm", changed(ImagePositionPatient=["1.25", "2", "3"]))
+    whole = path.read_bytes()
+    assert whole.count(b"1.25\\2\\3") == 1
+    path.write_bytes(whole.replace(b"1.25\\2\\3", b"x.25\\2\\3"))
+    assert_refused(path, "expected 3 finite numbers for its ImagePositionPatient")
+
+
+def test_objects_beside_a_series_are_skipped(tmp_path):
+    folder = slices_of(tmp_path / "d")
+    saved(folder / "rs.dcm", without_voxels(ROIContourSequence=[]))
+    (folder / "DICOMDIR").write_bytes(b"anything")
+    (folder / "notes.txt").write_text("anything")
+    with pytest.warns(UserWarning, match=r"skipped rs\.dcm, which is of the kind RT Structure Set Storage"):
+        assert_placed(load_image(folder))
+
+
+def test_a_file_without_first_part(tmp_path):
+    """As older programs wrote them: no mark, and no transfer syntax."""
+    folder = slices_of(tmp_path / "d")
+    for path in folder.iterdir():
+        data = pydicom.dcmread(path)
+        data.file_meta, data.preamble = FileMetaDataset(), None
+        pydicom.dcmwrite(path, FileDataset(path, data), implicit_vr=True, little_endian=True)
+        path.rename(path.with_suffix(""))
+    assert_placed(load_image(folder))
+
+
+def test_compressed_voxels(tmp_path):
+    data = enhanced(RAMP[ORDER], places()[ORDER])
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = EXPLICIT
+    data.compress("1.2.840.10008.1.2.5", encoding_plugin="pydicom")  # RLE
+    path = saved(tmp_path / "a.dcm", data, "1.2.840.10008.1.2.5")
+    assert_placed(load_image(path))
+    whole = path.read_bytes()
+    path = saved(tmp_path / "b.dcm", data, "1.2.840.10008.1.2.4.100")
+    assert "damaged" not in assert_refused(path, "compressed as MPEG2 .*cannot be decoded here; .*gdcmconv")
+    path.write_bytes(whole[:-40])
+    assert_refused(path, "truncated or damaged")

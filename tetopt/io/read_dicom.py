@@ -1,0 +1,653 @@
+"""Reading of DICOM by pydicom, in a separate process: series of slices, files of many frames, and segmentations.
+
+A file has one frame or many; each frame states where it lies, itself or by what the file states of all. The frames of
+one volume, of one file or of a whole series, are sorted by position and checked in one place (`_placed`): parallel,
+evenly spaced, one of each position. A segmentation leaves out empty frames, so its slices may be missing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.io.apart import read_apart
+from tetopt.io.units import notes_of_size
+from tetopt.io.volumes import UNREADABLE_FILE, check_room, one_line, volume_index
+from tetopt.system.extras import install_hint
+from tetopt.system.incoming import irregular
+
+DICOM_SUFFIX = ".dcm"
+# Slices may deviate from an even spacing by this fraction of it, because positions are often rounded.
+_UNEVEN_FRACTION = 0.05
+_SAME_PLACE_MM = 1e-3  # slices closer to each other share one position
+_SAME_DIRECTION = 1e-4  # of direction cosines
+# In a folder without DICOM files: subfolders searched, files tried in each, and subfolders listed in the message.
+WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
+# How files without DICOM's mark begin: a tag of group 8, or that group's length.
+FIRST_TAGS = re.compile(rb"\x08\0(\0\0(UL\x04\0|\x04\0\0\0)|[\x01\x05\x08\x12-\x18]\0)")
+LISTED_OVERLAPS = 3  # pairs of segments in a message
+SEGMENT_FRACTION = 0.5  # of a voxel: from this fraction on, it belongs to a segment
+# Stored numbers of so many bits, rescaled by whole numbers up to these, are exact in float32.
+EXACT_BITS, LARGEST_SLOPE, LARGEST_INTERCEPT = 16, 64, 2**22
+VOXELS = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
+# Tags by which dimensions order frames in space, or segments; others distinguish volumes, such as echoes.
+SPATIAL_DIMENSIONS = (0x00200032, 0x00200037, 0x00209056, 0x00209057, 0x00209113, 0x00209128, 0x0062000B)
+AXIAL_DIRECTIONS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # of rows and columns that are not stated
+ALONE = "put the files of one into a separate folder"
+NO_PLACES = (
+    "does not state where its {} frames lie (cine, or an old kind of file); convert it with a program that knows, such "
+    "as dcm2niix, or export a series of slices"
+)
+
+
+class DicomFile(NamedTuple):
+    """A file with voxels."""
+
+    name: str  # subject of messages
+    tags: Any  # pydicom's Dataset
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames by the header, at least 1."""
+        return max(int(self.tags.get("NumberOfFrames") or 1), 1)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Numbers of columns and rows."""
+        return int(self.tags.Columns), int(self.tags.Rows)
+
+    @property
+    def is_segmentation(self) -> bool:
+        """Whether its frames are of segments, and not of a scan."""
+        return "SegmentSequence" in self.tags
+
+
+class Frame(NamedTuple):
+    """A plane of voxels, by what its file states; lengths in mm, LPS."""
+
+    name: str  # subject of messages
+    file: DicomFile
+    number: int  # among the frames of the file, from 0
+    place: tuple[float, ...]  # of its first voxel; empty if unknown
+    axes: tuple[float, ...]  # directions of its rows (along which columns are counted), and of its columns
+    pixel: tuple[float, ...]  # between rows, and between columns; empty if unknown
+    step: float  # to the next slice; 0 if unknown
+    thickness: float  # 0 if unknown
+    scale: tuple[float, float]  # slope and intercept of its values
+    volume: tuple[str, int]  # stack, and time
+    others: tuple[int, ...]  # indices of other dimensions than these and the position
+    segment: int
+
+
+class FrameGrid(NamedTuple):
+    """Where frames lie."""
+
+    affine: NDArray[np.float64]  # (4, 4), RAS
+    slices: NDArray[np.int64]  # of each frame, from 0
+    n_slices: int
+
+
+def read_dicom(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of a file, or of the one series in a folder; InputError without a leading path."""
+    data, affine, words = _read(image_of, path, volume)
+    notes += words + notes_of_size(data.shape, affine, np.ones(3))  # DICOM's unit is the mm
+    return data, affine
+
+
+def read_segments(path: Path) -> list[tuple[int, str, list[float]]]:
+    """Return number, name and colour (empty if it has none) of the segments; none of other kinds of DICOM."""
+    return [tuple(row) for row in _read(segments_of, path)]
+
+
+def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
+    if importlib.util.find_spec("pydicom") is None:
+        raise InputError(
+            f"DICOM needs pydicom; {install_hint('dicom', 'pydicom', 'python-gdcm')}, or dcm2niix converts it"
+        )
+    size = None
+    if path.is_dir():
+        files = sorted(path.iterdir())
+        for file in files:
+            other = None if file.is_symlink() and not file.exists() else irregular(file)
+            if other not in (None, "a folder"):
+                raise InputError(f"{file.name} is {other}; move it out of the folder of DICOM files")
+        size = sum(file.stat().st_size for file in files if file.is_file())
+    return read_apart(read, path, *rest, size=size, library="pydicom")
+
+
+# In the child
+
+
+def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64], list[str]]:
+    """Return data, affine and warnings."""
+    notes: list[str] = []
+    files = _series(Path(path), notes)
+    is_segmentation = any(file.is_segmentation for file in files)
+    if is_segmentation and len(files) > 1:
+        raise InputError(f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}")
+    for file in files:
+        _check_voxels(file)
+    _check_sizes(files)
+    frames = _one_volume([frame for file in files for frame in _frames(file, notes)], volume)
+    grid = _placed(frames, notes, is_sparse=is_segmentation)
+    shape = (grid.n_slices, *files[0].size[::-1])
+    check_room(shape[::-1], np.dtype(np.float32).itemsize)
+    data = (_segmented if is_segmentation else _rescaled)(frames, grid, shape, notes)
+    return data.T, grid.affine, notes
+
+
+def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
+    """Return number, name and colour of each segment; a name that several segments have gets their numbers."""
+    rows = []
+    for file in _series(Path(path), []):
+        for segment in file.tags.get("SegmentSequence") or ():
+            lab = segment.get("RecommendedDisplayCIELabValue")
+            name = one_line(segment.get("SegmentLabel") or segment.get("SegmentDescription") or "")
+            rows.append((int(segment.SegmentNumber), name, [] if lab is None else _srgb([int(part) for part in lab])))
+    count = Counter(name for _, name, _ in rows)
+    return [(number, name if count[name] == 1 or not name else f"{name} {number}", tone) for number, name, tone in rows]
+
+
+def _srgb(lab: Sequence[int]) -> list[float]:
+    """Convert DICOM's CIELAB, 16 bits a part, to sRGB, 0 to 1; white is D65's, as in the programs that write it."""
+    lightness, a, b = np.array(lab) / 65535.0 * [100.0, 255.0, 255.0] - [0.0, 128.0, 128.0]
+    y = (lightness + 16.0) / 116.0
+    f = np.array([y + a / 500.0, y, y - b / 200.0])
+    xyz = np.where(f > 6.0 / 29.0, f**3, (f - 4.0 / 29.0) * 108.0 / 841.0) * [0.95047, 1.0, 1.08883]
+    linear = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]) @ xyz
+    gamma = 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055
+    return np.clip(np.where(linear > 0.0031308, gamma, 12.92 * linear), 0.0, 1.0).tolist()
+
+
+# Files
+
+
+def _series(path: Path, notes: list[str]) -> list[DicomFile]:
+    """Open the file, or the files of the one series in a folder, in the order of their names."""
+    if not path.is_dir():
+        file = _opened(path, "the file")
+        if file is None:
+            raise InputError(UNREADABLE_FILE)
+        if words := _no_voxels(file):
+            raise InputError(f"{file.name} {words}")
+        return [file]
+    series: dict[str, list[DicomFile]] = {}
+    for each in sorted(file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"):
+        file = _opened(each, f"the DICOM file {each.name}") if _is_dicom(each) else None
+        if file is None:
+            continue
+        if (words := _no_voxels(file)) and "Rows" in file.tags:
+            raise InputError(f"{file.name} {words}")
+        if words:
+            notes.append(f"skipped {each.name}, which {words.partition(';')[0]}")
+            continue
+        series.setdefault(str(file.tags.get("SeriesInstanceUID", "")), []).append(file)
+    if not series:
+        folders = islice(_dicom_folders(path), LISTED_FOLDERS)
+        if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in folders):
+            raise InputError(f"no DICOM series in this folder itself; choose one of its subfolders: {below}")
+        skipped = f" ({notes[0]})" if notes else ""
+        raise InputError(f"no DICOM series in this folder or its subfolders{skipped}; check the path")
+    if len(series) > 1:
+        listed = ", ".join(f"{uid} ({len(files)} files)" for uid, files in series.items())
+        raise InputError(f"expected one DICOM series, got {len(series)}; put one into its own folder: {listed}")
+    return next(iter(series.values()))
+
+
+def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
+    """Yield subfolders that contain DICOM files, within limits, with their numbers of files."""
+    for name, folders, files in islice(os.walk(path), WALKED_FOLDERS):
+        folders.sort()  # the order in which the walk continues
+        first = [Path(name, file) for file in sorted(files)[:TRIED_FILES]]
+        if any(file.is_file() and _is_dicom(file) for file in first):
+            yield Path(name), len(files)
+
+
+def _is_dicom(path: Path) -> bool:
+    """Return whether the file has DICOM's mark after 128 bytes, or begins with a first tag, as older files do."""
+    with path.open("rb") as stream:
+        head = stream.read(132)
+    return head[128:] == b"DICM" or FIRST_TAGS.match(head) is not None
+
+
+def _opened(path: Path, name: str) -> DicomFile | None:
+    """Open a file whole; None if it is not DICOM."""
+    import pydicom
+
+    with _errors_of(name):
+        tags = pydicom.dcmread(path, force=True)
+        if "SOPClassUID" not in tags and "Rows" not in tags and "DirectoryRecordSequence" not in tags:
+            if tags.preamble is None:
+                return None
+            raise InputError(f"{name} is truncated or damaged; copy it again")
+        if "TransferSyntaxUID" not in tags.file_meta:  # an older file, or one without its first part
+            is_implicit, _ = tags.original_encoding
+            plain = pydicom.uid.ImplicitVRLittleEndian if is_implicit else pydicom.uid.ExplicitVRLittleEndian
+            tags.file_meta.TransferSyntaxUID = plain
+        return DicomFile(name, tags)
+
+
+@contextlib.contextmanager
+def _errors_of(name: str) -> Iterator[None]:
+    """Name the file in errors; libraries raise any error on damaged files."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:
+        words = f"{type(error).__name__}: {one_line(error)[:200]}"
+        raise InputError(f"{name} is truncated or damaged; copy it again ({words})") from error
+
+
+def _no_voxels(file: DicomFile) -> str:
+    """Describe a file without voxels as a predicate; empty if it has some."""
+    tags = file.tags
+    if any(keyword in tags for keyword in VOXELS):
+        return ""
+    if "DirectoryRecordSequence" in tags:
+        return "is a DICOMDIR, a list of files; give the folder with one series"
+    if "Rows" in tags:
+        return "has no pixel data; copy or export it again"
+    kind = getattr(tags.get("SOPClassUID"), "name", "DICOM object")
+    if "ROIContourSequence" in tags:
+        return f"is of the kind {kind}: contours, no voxels; convert them to a label image, as 3D Slicer can"
+    return f"is of the kind {kind}, without voxels; give the images themselves"
+
+
+def _check_voxels(file: DicomFile) -> None:
+    """Raise InputError unless the voxels are numbers that can be decoded here."""
+    from pydicom.pixels import get_decoder
+
+    tags = file.tags
+    with _errors_of(file.name):
+        if (count := int(tags.get("SamplesPerPixel") or 1)) > 1:
+            raise InputError(f"{file.name} has {count} numbers per voxel (RGB or vectors); convert it to grey first")
+        if tags.get("PhotometricInterpretation") == "PALETTE COLOR" and not file.is_segmentation:
+            raise InputError(f"{file.name} has colours from a palette; convert it to grey first")
+        if "MOSAIC" in (tags.get("ImageType") or ()):
+            raise InputError(
+                f"{file.name} is a mosaic: its slices lie side by side in one picture; dcm2niix converts it"
+            )
+        syntax = tags.file_meta.TransferSyntaxUID
+        try:
+            is_known = get_decoder(syntax).is_available
+        except NotImplementedError:
+            is_known = False
+        if not is_known:
+            hint = f"{install_hint('dicom', 'python-gdcm')}, or decompress it with gdcmconv or dcmdjpeg"
+            raise InputError(f"{file.name} is compressed as {syntax.name}, which cannot be decoded here; {hint}")
+        n_bytes = max(len(tags[keyword].value) for keyword in VOXELS if keyword in tags)
+        columns, rows = file.size
+        least = (
+            8 * file.n_frames if syntax.is_compressed else file.n_frames * rows * columns * int(tags.BitsAllocated) // 8
+        )
+        if not min(columns, rows, n_bytes) > 0 or least > n_bytes:
+            raise InputError(
+                f"{file.name} is truncated or damaged: its header declares {file.n_frames} x {rows} x {columns} "
+                f"voxels, at least {least:.4g} bytes, but it has {n_bytes}; copy it again"
+            )
+
+
+def _check_sizes(files: list[DicomFile]) -> None:
+    """Raise InputError for files of different numbers of pixels."""
+    sizes = Counter(file.size for file in files)
+    most, count = sizes.most_common(1)[0]
+    for file in files:
+        if file.size != most:
+            here, there = ("{} x {}".format(*size) for size in (file.size, most))
+            raise InputError(
+                f"{file.name} has {here} pixels, and {count} others of its series have {there} (is it a localizer?); "
+                "move it out of the folder"
+            )
+
+
+# Frames
+
+
+def _frames(file: DicomFile, notes: list[str]) -> list[Frame]:
+    """Return the frames of a file, as their functional groups state, or else the file."""
+    with _errors_of(file.name):
+        tags, n = file.tags, file.n_frames
+        shared = (tags.get("SharedFunctionalGroupsSequence") or [{}])[0]
+        own = tags.get("PerFrameFunctionalGroupsSequence") or []
+        if own and len(own) != n:
+            raise InputError(f"{file.name} has {n} frames, but states where {len(own)} lie; export it again")
+        is_plain = not own and n > 1
+        places = _stacked(file, notes) if is_plain and not file.is_segmentation else None
+        frames = [_frame(file, k, (own[k] if own else {}, shared)) for k in range(n)]
+        return frames if places is None else [f._replace(place=p) for f, p in zip(frames, places, strict=True)]
+
+
+def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
+    name = f"frame {index + 1} of {file.name}" if file.n_frames > 1 else file.name
+    tags = file.tags
+
+    def stated(keyword: str, sequence: str, default: Any = None) -> Any:
+        """Return a tag of the frame's own groups, of the shared ones, or of the file."""
+        for group in groups:
+            items = group.get(sequence)
+            if items and items[0].get(keyword) is not None:
+                return items[0].get(keyword)
+        value = tags.get(keyword)
+        return default if value is None else value
+
+    def numbers(keyword: str, sequence: str, count: int) -> tuple[float, ...]:
+        return _numbers(name, keyword, lambda: stated(keyword, sequence), count)
+
+    pixel: tuple[float, ...] = ()
+    for keyword in ("PixelSpacing", "ImagerPixelSpacing", "NominalScannedPixelSpacing"):
+        pixel = pixel or numbers(keyword, "PixelMeasuresSequence", 2)
+    content = "FrameContentSequence"
+    indices = stated("DimensionIndexValues", content, ())
+    indices = [int(value) for value in (indices if np.iterable(indices) else [indices])]
+    dimensions = [int(each.DimensionIndexPointer) for each in tags.get("DimensionIndexSequence") or ()]
+    pairs = zip(dimensions, indices, strict=True) if len(dimensions) == len(indices) else ()
+    slope = (numbers("RescaleSlope", "PixelValueTransformationSequence", 1) or (1.0,))[0]
+    if "DoseGridScaling" in tags:
+        slope = float(tags.DoseGridScaling)
+    return Frame(
+        name, file, index,
+        place=numbers("ImagePositionPatient", "PlanePositionSequence", 3),
+        axes=numbers("ImageOrientationPatient", "PlaneOrientationSequence", 6),
+        pixel=pixel,
+        step=(numbers("SpacingBetweenSlices", "PixelMeasuresSequence", 1) or (0.0,))[0],
+        thickness=(numbers("SliceThickness", "PixelMeasuresSequence", 1) or (0.0,))[0],
+        scale=(slope, (numbers("RescaleIntercept", "PixelValueTransformationSequence", 1) or (0.0,))[0]),
+        volume=(str(stated("StackID", content, "")), int(stated("TemporalPositionIndex", content, 0))),
+        others=tuple(value for tag, value in pairs if tag not in SPATIAL_DIMENSIONS),
+        segment=int(stated("ReferencedSegmentNumber", "SegmentIdentificationSequence", 0)),
+    )  # fmt: skip
+
+
+def _numbers(name: str, keyword: str, source: Callable[[], Any], count: int) -> tuple[float, ...]:
+    """Return the numbers of a tag, none if it is missing; pydicom converts their texts only when asked."""
+    try:
+        value = source()
+        if value is None or value == "":
+            return ()
+        numbers = [float(each) for each in (value if np.iterable(value) and not isinstance(value, str) else [value])]
+    except (ValueError, TypeError, OverflowError):
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        plural = "s" * (count > 1)
+        raise InputError(f"{name}: expected {count} finite number{plural} for its {keyword}; export it again")
+    return tuple(numbers)
+
+
+def _stacked(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
+    """Return the places of frames without functional groups, where the file states a distance between them."""
+    tags, n = file.tags, file.n_frames
+    detectors = tags.get("DetectorInformationSequence") or []
+    for each in detectors if len(detectors) == 1 else ():  # nuclear medicine
+        for keyword in ("ImagePositionPatient", "ImageOrientationPatient"):
+            if keyword in each and keyword not in tags:
+                tags[keyword] = each[keyword]
+    first = _frame(file, 0, ())
+    offsets = _numbers(file.name, "GridFrameOffsetVector", lambda: tags.get("GridFrameOffsetVector"), n)
+    pointer = tags.get("FrameIncrementPointer")
+    pointers = [int(each) for each in (pointer if np.iterable(pointer) else [pointer])] if pointer is not None else []
+    is_of_slices = not pointers or pointers == [0x00540080]  # slices, and not times, angles, phases or energies
+    if not first.place or not first.axes or not (offsets or (first.step and is_of_slices)):
+        raise InputError(f"{file.name} {NO_PLACES.format(n)}")
+    along = np.cross(first.axes[:3], first.axes[3:])
+    if not offsets:
+        notes.append(
+            f"its frames are put {first.step:.4g} mm apart along the slices' normal, as SpacingBetweenSlices states"
+        )
+        order = _numbers(file.name, "SliceVector", lambda: tags.get("SliceVector"), n) or range(1, n + 1)
+        offsets = tuple(first.step * (float(k) - 1.0) for k in order)
+    elif offsets[0] != 0.0:  # they are places along the patient's axis
+        if abs(along[2]) < 1.0 - _SAME_DIRECTION or abs(offsets[0] - first.place[2]) > _SAME_PLACE_MM:
+            raise InputError(f"{file.name} has a GridFrameOffsetVector that is not of its position; export it again")
+        along, offsets = np.array([0.0, 0.0, 1.0]), tuple(each - offsets[0] for each in offsets)
+    return [tuple((np.array(first.place) + each * along).tolist()) for each in offsets]
+
+
+def _one_volume(frames: list[Frame], volume: int | None) -> list[Frame]:
+    """Return the frames of one volume: of one stack and time, and of one echo or the like where frames repeat."""
+    is_repeated = len({(frame.volume, frame.place, frame.segment) for frame in frames}) < len(frames)
+    keys = [(*frame.volume, frame.others if is_repeated else ()) for frame in frames]
+    volumes = sorted(set(keys))
+    (chosen,) = volume_index((len(volumes),), volume)
+    return [frame for frame, key in zip(frames, keys, strict=True) if key == volumes[chosen]]
+
+
+# Places
+
+
+def _placed(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameGrid:
+    """Return the grid of frames from their own positions; raise InputError unless they are those of a volume.
+
+    The slice axis is that of the positions, not orthogonal to the others in a tilted gantry. With `is_sparse`, frames
+    may share a slice, and slices may have none.
+    """
+    first = frames[0]
+    axes = np.array(first.axes or AXIAL_DIRECTIONS).reshape(2, 3)
+    if not np.allclose(axes @ axes.T, np.eye(2), rtol=0.0, atol=0.02):
+        raise InputError(f"{first.name}: expected the directions of its axes to be orthogonal, got {first.axes}")
+    for frame in frames[1:]:
+        if len(frame.axes) != len(first.axes) or not np.allclose(
+            frame.axes, first.axes, rtol=0.0, atol=_SAME_DIRECTION
+        ):
+            raise InputError(
+                f"the DICOM slices are not parallel (a localizer?): {frame.name} and {first.name} have different "
+                "directions; choose another series"
+            )
+        if len(frame.pixel) != len(first.pixel) or not np.allclose(frame.pixel, first.pixel, rtol=1e-3, atol=0.0):
+            raise InputError(f"{frame.name} and {first.name} have pixels of different sizes; choose another series")
+    if not first.pixel or min(first.pixel) <= 0.0:
+        notes.append("states no size of pixels: 1 mm is assumed")
+    between_rows, between_columns = first.pixel if first.pixel and min(first.pixel) > 0.0 else (1.0, 1.0)
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    if unplaced := next((frame for frame in frames if not frame.place), None):
+        if len(frames) > 1:
+            raise InputError(f"{unplaced.name} does not state where it lies; convert or export the series again")
+        notes.append("states no position: its first voxel is put at the world's origin")
+    points = np.array([frame.place or (0.0, 0.0, 0.0) for frame in frames])
+    normal = np.cross(*axes)
+    step, slices = (_sparse if is_sparse else _even)(points, normal, frames, notes)
+    affine = np.eye(4)
+    affine[:3, :3] = np.column_stack([axes[0] * between_columns, axes[1] * between_rows, step])
+    affine[:3, 3] = points[slices.argmin()]
+    affine[:2] *= -1.0  # LPS to RAS
+    return FrameGrid(affine, slices, int(slices.max()) + 1)
+
+
+def _ranks(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the rank of each point, (n, 3), along the normal; the same for those at one place."""
+    order = np.argsort(points @ normal, kind="stable")
+    is_new = np.linalg.norm(np.diff(points[order], axis=0), axis=1) > _SAME_PLACE_MM
+    ranks = np.empty(len(points), dtype=np.int64)
+    ranks[order] = np.concatenate([[0], np.cumsum(is_new)])
+    return ranks
+
+
+def _even(
+    points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the step between slices, and each one's rank; InputError unless each has a place, evenly spaced."""
+    n, ranks = len(points), _ranks(points, normal)
+    if n == 1:
+        return normal * _thickness(frames[0], notes), ranks
+    n_places = int(ranks.max()) + 1
+    if n_places < n:
+        raise InputError(
+            f"the {n} slices of this DICOM series have {n_places} position{'s' * (n_places > 1)}: it has "
+            "several volumes (times, echoes or repeats); convert it to a 4-D NIfTI file (dcm2niix), or put the slices "
+            "of one volume into a separate folder"
+        )
+    points = points[np.argsort(ranks)]
+    step = (points[-1] - points[0]) / (n - 1)
+    off = np.linalg.norm(points - points[0] - np.arange(n)[:, None] * step, axis=1)
+    if off.max() > _UNEVEN_FRACTION * np.linalg.norm(step):
+        raise InputError(
+            f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the series again, or "
+            "resample it to NIfTI"
+        )
+    _check_step(step, normal, frames, notes)
+    return step, ranks
+
+
+def _sparse(
+    points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the step between slices, and each frame's slice; InputError unless all lie at multiples of the step.
+
+    The step is the one stated if the places fit it, and otherwise the smallest between two places.
+    """
+    ranks = _ranks(points, normal)
+    places = points[np.unique(ranks, return_index=True)[1]]
+    if len(places) == 1:
+        return normal * _thickness(frames[0], notes), ranks
+    along = np.linalg.norm(places - places[0], axis=1)
+    for length in (abs(frames[0].step), float(np.diff(along).min())):
+        if length <= _SAME_PLACE_MM:
+            continue
+        slices = np.rint(along / length)
+        step = (places[-1] - places[0]) / slices[-1]
+        off = np.linalg.norm(places - places[0] - slices[:, None] * step, axis=1)
+        if (np.diff(slices) > 0).all() and off.max() <= _UNEVEN_FRACTION * np.linalg.norm(step):
+            _check_step(step, normal, frames, notes)
+            if np.diff(slices).min() > 1:
+                notes.append(
+                    f"its slices are {length:.4g} mm apart as it states, but its frames {np.diff(along).min():.4g} mm "
+                    "or more: those between are empty"
+                )
+            return step, slices.astype(np.int64)[ranks]
+    raise InputError(
+        f"the frames of this segmentation are not at multiples of one distance ({_unevenness(places, off)}); export "
+        "it again, or resample it to NIfTI"
+    )
+
+
+def _thickness(frame: Frame, notes: list[str]) -> float:
+    """Return the extent of the only slice along its normal."""
+    length = abs(frame.step) or frame.thickness
+    if length <= 0.0:
+        notes.append("has one slice and states no thickness: 1 mm is assumed")
+        return 1.0
+    return length
+
+
+def _check_step(step: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]) -> None:
+    """Raise InputError for slices beside each other; note a step other than the one stated."""
+    across = float(step @ normal)
+    if across <= _SAME_PLACE_MM:
+        raise InputError("the DICOM slices lie beside each other, not above each other; choose another series")
+    lengths, stated = (across, float(np.linalg.norm(step))), abs(frames[0].step)
+    if stated and all(abs(length / stated - 1.0) > _UNEVEN_FRACTION for length in lengths):
+        notes.append(
+            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; SpacingBetweenSlices is "
+            f"{stated:.4g} mm"
+        )
+
+
+def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
+    """Describe where slices at `points`, (n, 3), mm, are uneven: an unusual step, or else the largest `off` (n,)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    usual = float(np.median(steps))
+    is_other = np.abs(steps - usual) > _UNEVEN_FRACTION * usual
+    if not is_other.any():
+        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its even place between first and last"
+    k = int(np.abs(steps - usual).argmax())
+    where = "elsewhere" if is_other.sum() == 1 else "at most places"
+    return (
+        f"a step of {steps[k]:.3g} mm between slices {k} and {k + 1}, counted from 0, and {usual:.3g} mm {where}: "
+        "one is missing, or several volumes are mixed"
+    )
+
+
+# Voxels
+
+
+def _planes(frames: list[Frame]) -> Iterator[NDArray]:
+    """Yield the stored values of frames of one file, (rows, columns)."""
+    from pydicom.pixels import iter_pixels
+
+    file, indices = frames[0].file, [frame.number for frame in frames]
+    is_all = indices == list(range(file.n_frames))  # read in one go
+    with _errors_of(file.name):
+        yield from iter_pixels(file.tags, raw=True, indices=None if is_all else indices)
+
+
+def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
+    """Return the values of frames, each rescaled as it states."""
+    if any("ModalityLUTSequence" in frame.file.tags for frame in frames):
+        notes.append("its values are as stored: its table of values (ModalityLUTSequence) is not applied")
+    scales, bits = {frame.scale for frame in frames}, max(int(frame.file.tags.BitsAllocated) for frame in frames)
+    is_exact = bits <= EXACT_BITS and all(
+        slope == round(slope)
+        and shift == round(shift)
+        and abs(slope) <= LARGEST_SLOPE
+        and abs(shift) <= LARGEST_INTERCEPT
+        for slope, shift in scales
+    )
+    data = np.empty(shape, dtype=np.float32 if is_exact else np.float64)
+    slices = dict(zip(map(id, frames), grid.slices.tolist(), strict=True))
+    of_file: dict[int, list[Frame]] = {}
+    for frame in frames:
+        of_file.setdefault(id(frame.file), []).append(frame)
+    for those in of_file.values():
+        for frame, plane in zip(those, _planes(those), strict=True):
+            data[slices[id(frame)]] = plane * frame.scale[0] + frame.scale[1]
+    return data
+
+
+def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
+    """Return the segments' numbers; where segments overlap, the larger number, or the larger fraction."""
+    tags = frames[0].file.tags
+    order = np.lexsort([np.array([frame.segment for frame in frames]), grid.slices])
+    frames, slices = [frames[k] for k in order], grid.slices[order]
+    names = {int(each.SegmentNumber): one_line(each.get("SegmentLabel") or "") for each in tags.SegmentSequence}
+    for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
+        if (one.segment, k) == (other.segment, before):
+            raise InputError(f"{one.name} and {other.name} have one segment and position; export it again")
+    data = np.zeros(shape, dtype=np.uint16)
+    if tags.get("SegmentationType") == "LABELMAP":
+        for k, plane in zip(slices, _planes(frames), strict=True):
+            data[k] = plane
+        return data
+    if unnamed := next((frame for frame in frames if frame.segment not in names), None):
+        raise InputError(f"{unnamed.name} states no segment of the file; export it again")
+    whole = 1
+    if tags.get("SegmentationType") == "FRACTIONAL":
+        whole = int(tags.MaximumFractionalValue)
+        notes.append(f"its segments are fractions: voxels belong to the largest, if it is {SEGMENT_FRACTION:g} or more")
+    return _labelled(frames, slices, data, whole, names, notes)
+
+
+def _labelled(
+    frames: list[Frame], slices: NDArray[np.int64], data: NDArray, whole: int, names: dict[int, str], notes: list[str]
+) -> NDArray:  # fmt: skip
+    """Write numbers of segments to `data`, for frames in the order of slices and segments; note overlaps."""
+    overlaps: Counter[tuple[int, int]] = Counter()
+    planes = _planes(frames)
+    for k in np.unique(slices):
+        those = [frame.segment for frame, each in zip(frames, slices, strict=True) if each == k]
+        stack = np.stack(list(islice(planes, len(those))))
+        is_in = stack >= SEGMENT_FRACTION * whole
+        largest = len(those) - 1 - np.where(is_in, stack, 0)[::-1].argmax(axis=0)
+        data[k] = np.where(is_in.any(axis=0), np.array(those)[largest], 0)
+        is_several = is_in[:, is_in.sum(axis=0) > 1].astype(np.int64)
+        shared = is_several @ is_several.T
+        overlaps.update({(those[i], those[j]): int(shared[i, j]) for i, j in np.argwhere(np.triu(shared, 1))})
+    if overlaps:
+        text = "; ".join(
+            f"{a} ({names[a]}) and {b} ({names[b]}) in {count} voxels"
+            for (a, b), count in overlaps.most_common(LISTED_OVERLAPS)
+        )
+        more = f"; and {len(overlaps) - LISTED_OVERLAPS} more pairs" if len(overlaps) > LISTED_OVERLAPS else ""
+        kept = "larger number" if whole == 1 else "larger fraction, or number"
+        notes.append(f"segments overlap, and the {kept} is kept: {text}{more}")
+    return data
