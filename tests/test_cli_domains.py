@@ -396,3 +396,36 @@ def test_the_background_takes_no_label(tmp_path, capsys):
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
     assert loaded.cell_data["volume"][loaded.cell_data["label"] == 3].sum() > 0.5 * (labels == 3).sum()
     assert "bright ones are removed" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", ["--background 0", "--mask l.nii.gz", "--mask m.nii.gz", ""])
+def test_a_map_of_one_label(tmp_path, capsys, monkeypatch, more):
+    """Also with one value in every voxel, where there is no label 0."""
+    monkeypatch.chdir(tmp_path)
+    ball = distance((20, 20, 20), 9, 10, 9) < 7
+    data = np.where(ball, 5.0, 0.0) if more and "m.nii" not in more else np.full(ball.shape, 5.0)
+    tetopt.save_image("l.nii.gz", tetopt.Image(data))
+    tetopt.save_image("m.nii.gz", tetopt.Image(1.0 * ball))
+    command = ["mesh", "l.nii.gz", "--labels", "l.nii.gz", *more.split(), "--nodes", "150", "--iterations", "1"]
+    assert exit_code(*command, "-o", "a.vtu", "--json", "a.json") == 0
+    assert np.unique(tetopt.load_mesh("a.vtu").cell_data["label"]).tolist() == [5]
+    (row,) = numbers_in(tmp_path / "a.json")["labels"]
+    assert (row["label"], row["voxels"], row["is_lost"]) == (5, ball.sum() if more else ball.size, False)
+    capsys.readouterr()
+
+
+def test_label_zero_within_a_mask_has_a_row(tmp_path, monkeypatch, capsys):
+    """A cavity of 123 voxels in a label, within a mask; voxels of label 0 outside do not count."""
+    monkeypatch.chdir(tmp_path)
+    ball = distance((24, 24, 24), 11, 12, 11)
+    labels = np.where(ball < 9, 2.0, 0.0) * (ball >= 4)
+    tetopt.save_image("l.nii.gz", tetopt.Image(labels))
+    tetopt.save_image("m.nii.gz", tetopt.Image(1.0 * (ball < 9)))
+    command = ["mesh", "l.nii.gz", "--labels", "l.nii.gz", "--mask", "m.nii.gz", "--nodes", "500", "--iterations", "3"]
+    assert exit_code(*command, "-o", "a.vtu", "--json", "a.json") == 0
+    zero, two = numbers_in(tmp_path / "a.json")["labels"]
+    assert (zero["label"], zero["voxels"], two["label"]) == (0, int((ball < 4).sum()), 2)
+    assert zero["dice"] > 0.9
+    numbers = [row["mesh_cavities"] for row in numbers_in(tmp_path / "a.json")["interfaces"]]
+    assert numbers == [0, 1]
+    capsys.readouterr()

@@ -232,9 +232,6 @@ def test_labels_that_are_none():
         "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
         "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
-    assert said(labels * 0 + 7) == (
-        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; omit them or use others"
-    )
 
 
 def test_label_files_of_floats():

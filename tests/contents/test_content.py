@@ -205,8 +205,8 @@ def test_float_labels_take_some_bytes_a_voxel():
         ({"images": contrasts()[0], "weights": [0.0]}, "weights: every image or label that varies has weight 0"),
         ({"weights": [1.0, 1e200, 1.0]}, "weights: expected one for each of 3 images"),
         (
-            {"labels": tetopt.Image(np.full((12, 13, 14), 3.0))},
-            "labels: expected two or more labels in the meshed region",
+            {"labels": tetopt.Image(np.zeros((12, 13, 14)))},
+            "labels: expected labels above 0, got 0 in every voxel",
         ),
         ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
         ({"label_weight": -1.0}, "label_weight: expected 0 or 0.001 to 1000, got -1.0"),

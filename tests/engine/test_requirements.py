@@ -151,11 +151,17 @@ def test_labels_without_cells():
         "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
     }
     assert violated(target, result._replace(labels=None)) == {}
-    # Within a mask label 0 is the outside, too.
+    # Within a mask label 0 is a label like the others, and that of voxels outside does not count.
     within = content(image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine))
     no_zero = result._replace(labels=np.where(result.labels == 0, 3, result.labels))
     assert "no cell has label 0" in violated(target, no_zero)["labels"]
-    assert "labels" not in violated(within, no_zero)
+    assert "no cell has label 0" in violated(within, no_zero)["labels"]
+    box = np.zeros(image.shape)
+    box[15:25, 1:7] = 1.0
+    inside = content(image, tetopt.Image(labels, image.affine), tetopt.Image(box, image.affine))
+    result = tetopt.mesh_image(inside, 100, iterations=1)
+    assert set(result.labels.tolist()) == {3}
+    assert "labels" not in result.violated
 
 
 @pytest.mark.full

@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from shapes import OBLIQUE, shaped
 
 import tetopt
-from tetopt.geometry.simplex import oriented
-from tetopt.measure.fidelity import FacetSurface, LabelFidelity, cell_labels, surface_areas
+from tetopt.geometry.simplex import centroids, oriented
+from tetopt.measure.fidelity import FacetSurface, LabelFidelity, cell_labels, label_fidelity, surface_areas
 from tetopt.measure.interfaces import (
     LabelInterface,
     label_interfaces,
@@ -76,6 +76,32 @@ def test_the_outside_is_no_label_but_is_around():
     only = of_cell == 1  # the two cubes alone: the outside is all around
     alone = part_of(mesh, only)
     assert broken(label_interfaces(image, alone, np.ones(only.sum()))[1]) == (1, 1, 0, 0)
+
+
+def test_a_void_that_the_mesh_leaves_out_is_a_cavity():
+    """A shell around a void of the mask, with an island in it; beside it a block with a cavity of label 0."""
+    labels = np.ones((7, 7, 12))
+    labels[3, 3, 9] = 0.0
+    inside = np.ones(labels.shape, dtype=bool)
+    inside[1:6, 1:6, 1:6], inside[3, 3, 3] = False, True
+    mask = tetopt.Image(inside)
+    image, mesh, of_cell = blocky(labels)
+    place = np.rint(image.to_index(centroids(mesh.points, mesh.cells))).astype(int)
+    is_in = inside[tuple(place.T)]
+    part = part_of(mesh, is_in)
+    zero, one = label_interfaces(image, part, of_cell[is_in], mask)
+    assert (one.cavities, one.mesh_cavities, zero.cavities, zero.mesh_cavities) == (2, 2, 0, 0)
+    assert (one.euler, one.mesh_euler) == (2 * (2 + 2), 2 * (2 + 2))
+    rows = label_fidelity(image, part, of_cell[is_in], mask)
+    assert [(row.label, row.voxels, row.dice, row.is_lost) for row in rows] == [
+        (0, 1, 1.0, False),
+        (1, inside.sum() - 1, 1.0, False),
+    ]
+    lost = label_fidelity(image, part, np.ones(is_in.sum()), mask)[0]
+    assert (lost.voxels, lost.is_lost, lost.dice) == (1, True, 0.0)
+    for measure in (label_interfaces, label_fidelity):
+        with pytest.raises(tetopt.InputError, match="mask: expected the labels' shape"):
+            measure(image, part, of_cell[is_in], tetopt.Image(inside[1:]))
 
 
 @pytest.mark.parametrize(("kind", "euler", "cavities"), [("hole", 4, 1), ("handle", 0, 0)])

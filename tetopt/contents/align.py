@@ -90,8 +90,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Raises
     ------
     InputError
-        A number of axes different from the image's, invalid labels, no label above 0 in the image's box, or a single
-        label in it.
+        A number of axes different from the image's, invalid labels, or no label above 0 in the image's box.
 
     Examples
     --------
@@ -103,15 +102,10 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     _check_axes(name, labels, image)
     check_labels(name, labels)
     moved = _moved(labels, image)
-    top = moved.max()
     if labels.data.max() == 0:
         raise InputError(f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?")
-    if top == 0:
+    if moved.max() == 0:
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
-    if moved.min() == top:
-        raise InputError(
-            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; omit them or use others"
-        )
     return Image(moved, image.affine)
 
 

@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
-from tetopt.contents.labels import check_labels, label_channels
+from tetopt.contents.labels import BACKGROUND_LABEL, check_labels, label_channels
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
 from tetopt.contents.probabilities import check_tissues, probable_memberships, tissue_labels, warn_of_sums
@@ -247,6 +247,9 @@ def content(
         labels = None if labels is None else continued(labels, beyond)
         tissues = [continued(tissue, beyond) for tissue in tissues]
     labels = tissue_labels(tissues) if tissues else labels
+    if labels is not None and labels.data.max() == BACKGROUND_LABEL:
+        where = "" if mask is None else " in the meshed region"
+        raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
     if len(images) == 1 and labels is None and weights[0] > 0.0:
         return plain(images[0])._replace(region=region, continuation=beyond, keeps_components=keep_components)
     members = None
@@ -262,8 +265,6 @@ def content(
     if labels is not None and label_weight > 0.0:
         number, codes = _one_hot(labels.data.astype(np.int64), region)
         codes = np.sqrt(label_weight) * codes
-        if len(codes) == 0:
-            raise InputError("labels: expected two or more labels in the meshed region, got one; omit them")
     if len(contrasts) + len(codes) == 0:
         raise InputError("weights: every image or label that varies has weight 0; give at least one a weight above 0")
     values, scale = _whole_numbers(contrasts, number, codes)
@@ -308,11 +309,11 @@ def _whole_numbers(
     If possible, their sums of squares along a row fit into 32 bits.
     """
     square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
-    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (number.shape[-1] * square)))
+    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (number.shape[-1] * (square or 1.0))))  # 0: a single label, alone
     # If one voxel or a rare label is much larger than the rest, sums take 64 bits, to keep enough levels.
     steps = [STEPS_PER_SIGMA / float(np.std(data, dtype=np.float64)) for data in contrasts]
     largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
-    scale = min(max([fitting, *steps]), 2.0**30 / largest)
+    scale = min(max([fitting, *steps]), 2.0**30 / (largest or 1.0))
     values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
     for row, data in zip(values, contrasts, strict=False):
         row[:] = np.rint(scale * data)
@@ -427,7 +428,7 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
 
     Each label has its value in one channel and 0 in the others. Labels that are nowhere near one another share a
     channel. The weight of a label's voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small
-    labels are not sacrificed for the surfaces of large ones; the total variance is 1.
+    labels are not sacrificed for the surfaces of large ones; the total variance is 1 (0 for one label).
     """
     counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
     present = np.flatnonzero(counts)
@@ -438,4 +439,4 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     channel = label_channels(number, len(fraction))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
     spread = float((codes**2 @ fraction - (codes @ fraction) ** 2).sum())
-    return number, (codes / np.sqrt(spread) if len(fraction) > 1 else codes[:0])
+    return number, (codes / np.sqrt(spread) if len(fraction) > 1 else 0.0 * codes)

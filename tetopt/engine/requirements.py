@@ -179,8 +179,6 @@ def _violated_labels(content: Content, result: MeshingResult) -> dict[str, str]:
     inside = members.partition[is_inside]
     counts = np.bincount(inside.ravel(), minlength=len(members.labels))
     is_large = counts > LABEL_VOXELS * members.parts
-    if content.region is not None:  # label 0 includes the outside
-        is_large &= members.labels > 0
     lost = [str(label) for label in members.labels[is_large] if label not in result.labels]
     if not lost:
         return {}

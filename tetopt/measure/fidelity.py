@@ -18,10 +18,11 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL, check_labels
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box
+from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
@@ -223,11 +224,14 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     return _majority(labels, mesh, cell_of_voxel(labels, mesh))
 
 
-def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) -> list[LabelFidelity]:
+def label_fidelity(
+    labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None, mask: Image | None = None
+) -> list[LabelFidelity]:
     """Measure how well cells represent each label of an image.
 
-    The space outside the mesh counts as label 0, like the background around the mesh of a mask: its voxels get label 0,
-    the mesh's boundary off the box is a surface between 0 and the labels inside, and label 0 is not lost there.
+    Without a mask, the space outside the mesh counts as label 0: its voxels get label 0, the mesh's boundary off the
+    box is a surface between 0 and the labels inside, and label 0 is not lost there. With a mask, label 0 is a label
+    like the others, and no label has the space outside.
 
     Parameters
     ----------
@@ -237,16 +241,19 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
         Points in world coordinates, mm.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell; `cell_labels` by default.
+    mask : Image, optional
+        Mask on the same voxels; only voxels of 1/2 or more count.
 
     Returns
     -------
     list of LabelFidelity
-        One for each label in the image including 0, ascending.
+        One for each label in the image, or in the mask, including 0, ascending.
 
     Raises
     ------
     InputError
-        Values that are not labels, not one label per cell, or the reasons of `tetopt.cell_moments`.
+        Values that are not labels, not one label per cell, a mask on other voxels, or the reasons of
+        `tetopt.cell_moments`.
 
     Examples
     --------
@@ -262,14 +269,17 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     check_labels("labels", labels)
     owner = cell_of_voxel(labels, mesh)
     label_of_cell = _majority(labels, mesh, owner) if of_cell is None else checked_cell_labels(of_cell, mesh)
-    true, painted = labels.data.astype(np.int32), np.maximum(_painted(owner, label_of_cell), 0)
-    n_true, n_painted, n_both = (_counts(v.ravel()) for v in (true, painted, true[true == painted]))
+    true, painted = labels_in_mask(labels, mask), _painted(owner, label_of_cell)
+    outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
+    painted[owner < 0] = outside
+    n_true, n_painted, n_both = (_counts(v[v >= 0]) for v in (true, painted, true[true == painted]))
     n_cells, mesh_volume = _counts(label_of_cell), _counts(label_of_cell, volumes(mesh.points, mesh.cells))
     n_empty = _counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
-    overlap, beyond = _overlaps(labels, mesh, label_of_cell, len(n_true))
+    overlap, beyond = _overlaps(Image(true, labels.affine), mesh, label_of_cell, len(n_true))
+    has_outside = (np.arange(len(n_true)) == outside).astype(float)
     boxes = scipy.ndimage.find_objects(true + 1)
     shared = facets(mesh.cells)
-    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell, shared)
+    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell, shared, outside)
     one_layer = one_layer_fractions(mesh, label_of_cell, shared)
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
@@ -289,14 +299,14 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
                 int(n_empty[label]),
                 _dice(n_both[label], n_true[label], n_painted[label]),
                 _dice(
-                    overlap[label] + (label == 0) * beyond[0],
+                    overlap[label] + has_outside[label] * beyond[0],
                     n_true[label] * labels.voxel_volume,
-                    mesh_volume[label] + (label == 0) * beyond[1],
+                    mesh_volume[label] + has_outside[label] * beyond[1],
                 ),
                 *_mean_and_p95(distances),
                 int(scipy.ndimage.label(part == label)[1]),
                 _n_components(mesh.cells[label_of_cell == label]),
-                bool(n_cells[label] == 0 and (label > 0 or owner.min() >= 0)),
+                bool(n_cells[label] == 0 and (label != outside or owner.min() >= 0)),
                 float(distances.max(initial=0.0)) if len(distances) else np.nan,
                 one_layer.get(int(label), np.nan),
             )
@@ -462,6 +472,14 @@ def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
     return total
 
 
+def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
+    """Labels of the voxels, `OUTSIDE_LABEL` where a mask is below 1/2; raise InputError for a mask on other voxels."""
+    data = labels.data.astype(np.int32)
+    if mask is not None and mask.shape != labels.shape:
+        raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
+    return data if mask is None else np.where(mask.data >= INSIDE_FRACTION, data, np.int32(OUTSIDE_LABEL))
+
+
 def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
     """`cell_labels` from the cell of each voxel, counting only pairs of cell and label that occur."""
     is_in_mesh = owner >= 0
@@ -516,13 +534,13 @@ def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) 
 
 
 def _labels_beside_facets(
-    labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets
+    labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets, outside: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All facets (F, n) and the labels on both sides (F, 2): 0 outside, and the same label on both sides of the box."""
+    """All facets (F, n) and the labels on both sides (F, 2), the same label on both sides of the box."""
     sides = of_cell[shared.cells]
     is_outer = shared.n_cells == 1
     is_on_box = facets_on_box(mesh, labels)[1]  # in the order of the facets
-    sides[is_outer, 1] = np.where(is_on_box, sides[is_outer, 0], 0)
+    sides[is_outer, 1] = np.where(is_on_box, sides[is_outer, 0], outside)
     return shared.nodes, sides
 
 

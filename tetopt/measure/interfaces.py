@@ -24,7 +24,7 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.topology import Facets, facets, linked
 from tetopt.image import Image, transformed
-from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, surface_areas
+from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, labels_in_mask, surface_areas
 from tetopt.mesh import Mesh
 
 FOLD_DEGREES = 60.0  # least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
@@ -93,7 +93,7 @@ class LabelInterface(NamedTuple):
     mesh_cavities: int
 
 
-def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[LabelInterface]:
+def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None) -> list[LabelInterface]:
     """Measure the smoothness, connectivity and manifoldness of the surface of each label of an image.
 
     Parameters
@@ -104,16 +104,18 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
         A conforming mesh.
     of_cell : (M,) array of whole numbers
         Label of each cell, such as from `tetopt.measure.fidelity.cell_labels`.
+    mask : Image, optional
+        Mask on the same voxels; only voxels of 1/2 or more count.
 
     Returns
     -------
     list of LabelInterface
-        One for each label in the image including 0, ascending.
+        One for each label in the image, or in the mask, including 0, ascending.
 
     Raises
     ------
     InputError
-        Values that are not labels, or not one label per cell.
+        Values that are not labels, not one label per cell, or a mask on other voxels.
 
     Examples
     --------
@@ -127,7 +129,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     """
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
-    voxels = labels.data.astype(np.int32)
+    voxels = labels_in_mask(labels, mask)
     boxes = scipy.ndimage.find_objects(voxels + 1)
     present = np.array([label for label, box in enumerate(boxes) if box is not None])
     shared = facets(mesh.cells)
@@ -148,7 +150,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
         "nonmanifold_nodes": counts(fans.label[nodes]),
         "nonmanifold_nodes_two_labels": counts(fans.label[nodes & (fans.n_labels == 2)]),
         "mesh_euler": _cell_eulers(shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)),
-        "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels),
+        "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels, _outer_spaces(mesh.points, surfaces)),
     }
     area = counts(surfaces.label, surface_areas(FacetSurface(mesh.points, surfaces.nodes)))
     n_folded, n_paired = counts(ridges.label[turns > FOLD_DEGREES]), counts(ridges.label[np.isfinite(turns)])
@@ -282,21 +284,20 @@ def _cell_eulers(
 
 
 def _cell_cavities(
-    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int
+    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int, space: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """`voxel_cavities` of each label's cells: nodes connect the space around them."""
+    """`voxel_cavities` of each label's cells: nodes connect the space around them; see `_outer_spaces`."""
     cavities = np.zeros(n_labels, dtype=np.int64)
     if cells.shape[1] == 3:
         return cavities
     near, far = shared.cells[(shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] == of_cell[shared.cells[:, 1]])].T
     n_pieces, piece = linked(near, far, len(cells))
-    of_piece = np.empty(n_pieces + 1, dtype=np.int64)
-    of_piece[piece], of_piece[n_pieces] = of_cell, OUTSIDE_LABEL
-    boundary = np.unique(shared.nodes[shared.n_cells == 1])
-    meets = np.unique(
-        np.concatenate([(cells * (n_pieces + 1) + piece[:, None]).ravel(), boundary * (n_pieces + 1) + n_pieces])
-    )
-    node, piece = np.divmod(meets, n_pieces + 1)
+    n_in_all, boundary = n_pieces + int(space.max()) + 1, np.flatnonzero(space >= 0)
+    of_piece = np.full(n_in_all, OUTSIDE_LABEL)
+    of_piece[piece] = of_cell
+    outer = boundary * n_in_all + n_pieces + space[boundary]
+    meets = np.unique(np.concatenate([(cells * n_in_all + piece[:, None]).ravel(), outer]))
+    node, piece = np.divmod(meets, n_in_all)
     pairs = [np.empty((0, 2), dtype=np.int64)]
     for step in range(1, int(np.bincount(node).max())):  # link all components at a node
         is_same = node[step:] == node[:-step]
@@ -305,6 +306,47 @@ def _cell_cavities(
     for label in np.unique(of_cell):
         is_around = of_piece != label
         is_link = is_around[one] & is_around[other]
-        _, part = linked(one[is_link], other[is_link], n_pieces + 1)
+        _, part = linked(one[is_link], other[is_link], n_in_all)
         cavities[label] = len(np.unique(part[is_around])) - 1
     return cavities
+
+
+def _outer_spaces(points: NDArray[np.float64], surfaces: LabelSurfaces) -> NDArray[np.int64]:
+    """The connected part of the space outside the mesh that each boundary node lies at, (N,); -1 inside, 0 in 2-D.
+
+    0 is the unbounded part; the others are voids, each with a boundary component that faces inwards. The remaining
+    components, of islands, lie in the smallest void that contains them, or else in the unbounded part.
+    """
+    space = np.full(len(points), -1, dtype=np.int64)
+    outer = surfaces.nodes[(surfaces.beyond == OUTSIDE_LABEL) & (surfaces.label != OUTSIDE_LABEL)]
+    if points.shape[1] == 2:
+        space[outer] = 0
+        return space
+    _, number = linked(outer[:, [0, 0]].ravel(), outer[:, 1:].ravel(), len(points))
+    names, of_facet = np.unique(number[outer[:, 0]], return_inverse=True)
+    corners = points[outer] - points.mean(axis=0)
+    volume = np.bincount(of_facet, np.linalg.det(corners))
+    voids = np.flatnonzero(volume < 0.0)[np.argsort(-volume[volume < 0.0], kind="stable")]  # the smallest first
+    of_part = np.zeros(len(names), dtype=np.int64)
+    of_part[voids] = np.arange(1, len(voids) + 1)
+    walls = [corners[of_facet == part] for part in voids]
+    for part in np.flatnonzero(volume > 0.0):
+        place = corners[np.argmax(of_facet == part), 0]
+        holders = (k for k, wall in enumerate(walls, 1) if _encloses(wall, place))
+        of_part[part] = next(holders, 0)
+    space[outer] = of_part[of_facet][:, None]
+    return space
+
+
+def _encloses(wall: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
+    """True if a closed surface, corners (F, 3, 3), contains a place: its solid angles sum to a full turn.
+
+    A triangle's solid angle is that of van Oosterom and Strackee (IEEE Trans. Biomed. Eng. 30, 1983).
+    """
+    if (place < wall.min(axis=(0, 1))).any() or (place > wall.max(axis=(0, 1))).any():
+        return False
+    a, b, c = np.moveaxis(wall - place, 1, 0)
+    p, q, r = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    over = p * q * r + (a * b).sum(axis=1) * r + (b * c).sum(axis=1) * p + (c * a).sum(axis=1) * q
+    angles = 2.0 * np.arctan2((a * np.cross(b, c)).sum(axis=1), over)
+    return abs(float(angles.sum())) > 2.0 * np.pi

@@ -15,14 +15,14 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
-from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, local_thickness, thickness_between
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
+from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, surface_areas
+from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, labels_in_mask, surface_areas
 from tetopt.mesh import Mesh
 
 THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
@@ -98,14 +98,12 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     """
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
-    if mask is not None and mask.shape != labels.shape:
-        raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
     shared = facets(mesh.cells)
     sides = of_cell[shared.cells]
     is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
     area = surface_areas(FacetSurface(mesh.points, shared.nodes[is_contact]))
     in_mesh = _by_pair(sides[is_contact, 0], sides[is_contact, 1], area)
-    in_voxels = _voxel_contacts(labels, None if mask is None else mask.data >= INSIDE_FRACTION)
+    in_voxels = _voxel_contacts(labels, mask)
     return [
         LabelContact(
             (pair // LABEL_BASE, pair % LABEL_BASE), in_mesh.get(pair, 0.0), in_voxels.get(pair, 0.0),
@@ -123,16 +121,13 @@ def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
     }
 
 
-def _voxel_contacts(labels: Image, inside: NDArray[np.bool_] | None) -> dict[int, float]:
+def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
     """Contact area of each pair's voxels inside, as the area of smooth surfaces."""
-    data = labels.data.astype(np.int32)
+    data = labels_in_mask(labels, mask)
     total: dict[int, float] = {}
     for axis, edge in enumerate(labels.spacing):
         along = np.moveaxis(data, axis, 0)
-        is_contact = along[:-1] != along[1:]
-        if inside is not None:
-            is_in = np.moveaxis(inside, axis, 0)
-            is_contact &= is_in[:-1] & is_in[1:]
+        is_contact = (along[:-1] != along[1:]) & (np.minimum(along[:-1], along[1:]) != OUTSIDE_LABEL)
         face = STAIRS[labels.ndim] * float(np.prod(labels.spacing)) / float(edge)
         of_axis = _by_pair(along[:-1][is_contact], along[1:][is_contact])
         for pair, count in of_axis.items():

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, content, plain
+from tetopt.contents.content import Content, content, continued, plain
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
@@ -130,27 +130,22 @@ def fidelity(
 
     Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a `LabelInterface` in
     `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and their sums in `contact_totals`.
-    Entries of missing images are omitted. With a mask, labels count only inside it, and label 0, which also stands for
-    the outside, is omitted from the first two. `of_cell` (M,) is the label of each cell, by default that of most of its
-    voxels; for `failed` see `measured_each`; `what` is the content with the levels of these labels, if known.
+    Entries of missing images are omitted. With a mask, labels count only inside it. `of_cell` (M,) is the label of each
+    cell, by default that of most of its voxels; for `failed` see `measured_each`; `what` is the content with the levels
+    of these labels, if known.
     """
     measures: dict[str, Callable[[], Any]] = {}
     if mask is not None:
         measures["mask"] = lambda: mask_fidelity(mask, mesh)
     if labels is not None:
-        inside = labels if mask is None else Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
-        first = 0 if mask is None else 1
 
         def own() -> NDArray[np.int64]:
-            return cell_labels(inside, mesh) if of_cell is None else of_cell
+            return cell_labels(continued(labels, mask), mesh) if of_cell is None else of_cell
 
-        def measured_labels(measure: Callable[[Image, Mesh, NDArray], list[Any]]) -> list[Any]:
-            return [row for row in measure(inside, mesh, own()) if row.label >= first]
-
-        measures["labels"] = lambda: measured_labels(label_fidelity)
+        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask)
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
             measures["thickness"] = lambda: label_thickness(_with_levels(what, labels, mask), mesh, own())
-        measures["interfaces"] = lambda: measured_labels(label_interfaces)
+        measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
     measured = measured_each(measures, failed)
     thickness = measured.pop("thickness", {})
