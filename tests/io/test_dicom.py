@@ -89,13 +89,16 @@ def enhanced(frames, where, *, own=None, axes=AXES, **measures):
     return data
 
 
-def slices_of(folder, pixels=RAMP, where=None, kind=CT, **tags):
+def one_slice(pixels, place, **tags):
+    where = {"ImagePositionPatient": place.round(9).tolist(), "ImageOrientationPatient": AXES.ravel().tolist()}
+    return file_of(CT, pixels, PixelSpacing=[BETWEEN_ROWS, BETWEEN_COLUMNS], **where, **tags)
+
+
+def slices_of(folder, pixels=RAMP, where=None, **tags):
     """A series of single slices, named in another order than they lie."""
     folder.mkdir(exist_ok=True)
-    tags = {"ImageOrientationPatient": AXES.ravel().tolist(), "PixelSpacing": [BETWEEN_ROWS, BETWEEN_COLUMNS]} | tags
     for k, place in enumerate(places(len(pixels)) if where is None else where):
-        data = file_of(kind, pixels[k], ImagePositionPatient=place.round(9).tolist(), **tags)
-        saved(folder / f"s{(k * 7) % 11}.dcm", data)
+        saved(folder / f"s{(k * 7) % 11}.dcm", one_slice(pixels[k], place, **tags))
     return folder
 
 
@@ -141,7 +144,13 @@ def test_several_files_of_one_series_are_one_volume(tmp_path):
     assert_placed(load_image(tmp_path))
     assert_refused(tmp_path / "a.dcm", "volume from 0 to 0", volume=1)
     saved(tmp_path / "again.dcm", enhanced(RAMP[3:4], places()[3:4]))
-    assert_refused(tmp_path, "7 slices of this DICOM series have 6 positions: it has several volumes")
+    assert_refused(tmp_path, "7 slices of this DICOM series have 6 positions: .* several volumes .* separate folder")
+
+
+def test_several_volumes_in_files_of_their_own(tmp_path):
+    for name in "ab":
+        saved(tmp_path / f"{name}.dcm", enhanced(RAMP, places()))
+    assert_refused(tmp_path, "12 slices of this DICOM series have 6 positions: .* give one of its files")
 
 
 def turned(k):
@@ -161,7 +170,7 @@ def of_times(*times):
     ("data", "match"),
     [
         (lambda: enhanced(RAMP, places(7)[[0, 1, 2, 3, 6, 5]]), "a step of 6 mm between slices 3 and 4"),
-        (lambda: enhanced(RAMP, places()[[0, 1, 2, 3, 4, 4]]), "6 slices of this DICOM series have 5 positions"),
+        (lambda: enhanced(RAMP, places()[[0, 1, 2, 3, 4, 4]]), "6 slices of .* have 5 positions: .*; convert it"),
         (lambda: enhanced(RAMP, places(step=AXES[0])), "beside each other"),
         (lambda: enhanced(RAMP, places(), own=turned(2)), "not parallel .*frame 3 of the file"),
         (lambda: enhanced(RAMP, places(), own=[*[{}] * 5, SQUARE]), "frame 6 .*different sizes"),
@@ -322,6 +331,7 @@ def changed(**tags):
         (changed(Rows=400), "declares 1 x 400 x 5 voxels"),
         (changed(NumberOfFrames=10**9), "declares 1000000000 x 4 x 5 voxels"),
         (changed(Rows=0), "declares 1 x 0 x 5 voxels"),
+        (changed(PixelSpacing=[0, 1]), "expected pixels larger than 0, got 0 x 1 mm"),
     ],
     ids=lambda value: value[:12] if isinstance(value, str) else "",
 )
@@ -358,6 +368,19 @@ def test_a_file_without_first_part(tmp_path):
     assert_placed(load_image(folder))
 
 
+def test_a_file_without_suffix(tmp_path):
+    assert_placed(load_image(saved(tmp_path / "IM000001", enhanced(RAMP, places()))))
+    index = without_voxels("1.2.840.10008.1.3.10", DirectoryRecordSequence=[])
+    assert_refused(saved(tmp_path / "DICOMDIR", index), "give the folder with one series")
+
+
+def test_bits_beyond_those_stored_are_ignored(tmp_path):
+    """Signed numbers of 12 bits, below others' bits."""
+    data = one_slice((np.array([[-5, 7, -2048]]) & 0xFFF) | 0x5000, ORIGIN, SliceThickness=3)
+    data.BitsStored, data.HighBit = 12, 11
+    np.testing.assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048])
+
+
 def test_compressed_voxels(tmp_path):
     data = enhanced(RAMP[ORDER], places()[ORDER])
     data.file_meta = FileMetaDataset()
@@ -370,3 +393,124 @@ def test_compressed_voxels(tmp_path):
     assert "damaged" not in assert_refused(path, "compressed as MPEG2 .*cannot be decoded here; .*gdcmconv")
     path.write_bytes(whole[:-40])
     assert_refused(path, "truncated or damaged")
+
+
+# --------------------------------------------------------------------------------------------------
+# Segmentations
+
+
+@pytest.fixture(scope="module")
+def hd():
+    return pytest.importorskip("highdicom")
+
+
+def blobs(shape=(9, 8, 7)):
+    """Voxels (slices, rows, columns, segments) of three segments: the second overlaps the first, the third is apart."""
+    k, j, i = np.indices(shape)
+    first, second = (k >= 1) & (k <= 3) & (j < 6), (k == 3) & (j >= 4) & (i < 5)
+    return np.stack([first, second, (k == 7) & (i > 2)], axis=-1)
+
+
+COLOURS = [(128, 174, 128), (255, 0, 0), (20, 60, 200)]
+
+
+def segmentation(hd, path, voxels, kind="BINARY", **options):
+    """A segmentation of an oblique CT of single slices, 3 mm apart, without its empty frames."""
+    about = {"PatientName": "A^B", "StudyInstanceUID": "1.2.4", "FrameOfReferenceUID": "1.2.5", "Modality": "CT"}
+    about |= dict.fromkeys(("PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"), "")
+    about |= {"AccessionNumber": "", "ReferringPhysicianName": "", "SliceThickness": STEP}
+    source = []
+    for k, place in enumerate(places(len(voxels))):
+        source.append(one_slice(np.zeros(voxels.shape[1:3]), place, InstanceNumber=k + 1, PatientID="1", **about))
+        source[-1].file_meta = FileMetaDataset()
+        source[-1].file_meta.TransferSyntaxUID = EXPLICIT
+    tissue = hd.sr.CodedConcept("85756007", "SCT", "Tissue")
+    segments = [
+        hd.seg.SegmentDescription(
+            number, label, tissue, tissue, "MANUAL", display_color=hd.color.CIELabColor.from_rgb(*c)
+        )
+        for number, (label, c) in enumerate(zip(("liver", "tumour", "tumour"), COLOURS, strict=True), 1)
+    ]
+    hd.seg.Segmentation(source, voxels, kind, segments, "1.2.6", 1, "1.2.8", 1, "m", "m", "1", "1", **options).save_as(
+        path
+    )
+    return path
+
+
+def assert_segments(image, labels):
+    """Labels (slices, rows, columns) lie where they were; slices from the first to the last frame, of 1 to 7."""
+    affine = affine_of()
+    affine[:3, 3] += affine[:3, 2]
+    assert_placed(image, labels[1:8], affine)
+
+
+NUMBERS = np.array([1, 2, 3])
+
+
+def test_segments_by_number(tmp_path, hd, child):
+    """Empty slices between frames stay empty; of overlapping segments, the larger number is kept, and told."""
+    voxels = blobs()
+    path = segmentation(hd, tmp_path / "a.dcm", voxels)
+    assert len(pydicom.dcmread(path).PerFrameFunctionalGroupsSequence) == 5
+    with pytest.warns(UserWarning, match=r"larger number is kept: 1 \(liver\) and 2 \(tumour\) in 10 voxels$"):
+        assert_segments(load_image(path), (voxels * NUMBERS).max(axis=-1))
+
+
+def test_label_map_of_segments(tmp_path, hd):
+    labels = (blobs() * NUMBERS).max(axis=-1)
+    assert_segments(load_image(segmentation(hd, tmp_path / "a.dcm", labels.astype(np.uint8), "LABELMAP")), labels)
+
+
+def test_fractions_of_segments(tmp_path, hd):
+    """A voxel belongs to the largest fraction of a half or more."""
+    voxels = blobs()
+    path = segmentation(hd, tmp_path / "a.dcm", voxels * [0.8, 0.6, 0.49] + voxels[..., ::-1] * 0.01, "FRACTIONAL")
+    with pytest.warns(UserWarning, match=r"larger fraction, or number is kept: 1 \(liver\) and 2 .* in 10 voxels"):
+        image = load_image(path)
+    labels = np.where(voxels[..., 0], 1, 2 * voxels[..., 1])
+    assert_segments(image, labels)
+
+
+@pytest.mark.parametrize(("name", "counts", "slices"), [("overlap", [48, 16], 165), ("single_frame", [1832], 1)])
+def test_public_segmentations(data_dir, hd, name, counts, slices):
+    """Of highdicom's tests: 64 and 16 voxels, 16 of them in both; the first frame is 162 slices from the second."""
+    path = data_dir / f"seg_image_ct_binary_{name}.dcm"
+    image = load_image(path)
+    there = hd.seg.segread(path).get_volume(combine_segments=False, allow_missing_positions=True)
+    assert image.shape[2] == there.spatial_shape[0] == slices
+    np.testing.assert_array_equal(np.bincount(image.data.astype(int).ravel())[1:], counts)
+    is_in = there.array.any(axis=-1)
+    world = there.map_indices_to_reference(np.argwhere(is_in)).mean(axis=0) * [-1, -1, 1]
+    np.testing.assert_allclose(image.to_world(np.argwhere(image.data > 0)).mean(axis=0), world, rtol=0, atol=1e-4)
+
+
+def edited(hd, path, edit):
+    data = pydicom.dcmread(segmentation(hd, path, blobs()))
+    edit(data, [group.PlanePositionSequence[0] for group in data.PerFrameFunctionalGroupsSequence])
+    return saved(path, data)
+
+
+def test_segments_that_are_no_volume(tmp_path, hd):
+    def uneven(data, where):
+        where[-1].ImagePositionPatient = (places(9)[7] + 1.4 * NORMAL).round(9).tolist()
+
+    def twice(data, where):
+        where[1].ImagePositionPatient = where[0].ImagePositionPatient
+
+    def nameless(data, where):
+        data.SegmentSequence = data.SegmentSequence[:2]
+
+    for edit, match in (
+        (uneven, "not at multiples of one distance"),
+        (twice, "frame 1 of the file .*one segment and position"),
+        (nameless, "frame 5 of the file states no segment"),
+    ):
+        assert_refused(edited(hd, tmp_path / "a.dcm", edit), match)
+
+
+def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
+    def half(data, where):
+        data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices = STEP / 2
+
+    with pytest.warns(UserWarning, match="1.5 mm apart as it states, but its frames 3 mm"):
+        assert load_image(edited(hd, tmp_path / "a.dcm", half)).shape == (7, 8, 13)

@@ -31,7 +31,7 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
-from tetopt.io.read_dicom import DICOM_SUFFIX, read_dicom
+from tetopt.io.read_dicom import DICOM_SUFFIX, is_dicom, read_dicom
 from tetopt.io.read_itk import ITK_READERS, read_itk
 from tetopt.io.readback import save_checked
 from tetopt.io.units import mm_of_axes, notes_of_size
@@ -457,6 +457,8 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
     for suffix, read in READERS.items():
         if name.endswith(suffix):
             return read(path, volume, notes)
+    if is_dicom(path):  # scanners name files without a suffix
+        return read_dicom(path, volume, notes)
     known = ", ".join((*READERS, ZARR_SUFFIX))
     raise InputError(f"unknown image format; expected {known}, or a folder of DICOM files")
 

@@ -184,7 +184,7 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
         return [file]
     series: dict[str, list[DicomFile]] = {}
     for each in sorted(file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"):
-        file = _opened(each, f"the DICOM file {each.name}") if _is_dicom(each) else None
+        file = _opened(each, f"the DICOM file {each.name}") if is_dicom(each) else None
         if file is None:
             continue
         if (words := _no_voxels(file)) and "Rows" in file.tags:
@@ -210,11 +210,11 @@ def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
     for name, folders, files in islice(os.walk(path), WALKED_FOLDERS):
         folders.sort()  # the order in which the walk continues
         first = [Path(name, file) for file in sorted(files)[:TRIED_FILES]]
-        if any(file.is_file() and _is_dicom(file) for file in first):
+        if any(file.is_file() and is_dicom(file) for file in first):
             yield Path(name), len(files)
 
 
-def _is_dicom(path: Path) -> bool:
+def is_dicom(path: Path) -> bool:
     """Return whether the file has DICOM's mark after 128 bytes, or begins with a first tag, as older files do."""
     with path.open("rb") as stream:
         head = stream.read(132)
@@ -446,9 +446,11 @@ def _placed(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameG
             )
         if len(frame.pixel) != len(first.pixel) or not np.allclose(frame.pixel, first.pixel, rtol=1e-3, atol=0.0):
             raise InputError(f"{frame.name} and {first.name} have pixels of different sizes; choose another series")
-    if not first.pixel or min(first.pixel) <= 0.0:
+    if not first.pixel:
         notes.append("states no size of pixels: 1 mm is assumed")
-    between_rows, between_columns = first.pixel if first.pixel and min(first.pixel) > 0.0 else (1.0, 1.0)
+    between_rows, between_columns = first.pixel or (1.0, 1.0)
+    if min(between_rows, between_columns) <= 0.0:
+        raise InputError(f"{first.name}: expected pixels larger than 0, got {between_rows:g} x {between_columns:g} mm")
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     if unplaced := next((frame for frame in frames if not frame.place), None):
         if len(frames) > 1:
@@ -482,10 +484,14 @@ def _even(
         return normal * _thickness(frames[0], notes), ranks
     n_places = int(ranks.max()) + 1
     if n_places < n:
+        remedy = "put the slices of one volume into a separate folder, or "
+        if all(frame.file.n_frames == n for frame in frames):
+            remedy = ""
+        elif all(frame.file.n_frames == n_places for frame in frames):
+            remedy = "give one of its files, or "
         raise InputError(
             f"the {n} slices of this DICOM series have {n_places} position{'s' * (n_places > 1)}: it has "
-            "several volumes (times, echoes or repeats); convert it to a 4-D NIfTI file (dcm2niix), or put the slices "
-            "of one volume into a separate folder"
+            f"several volumes (times, echoes or repeats); {remedy}convert it to a 4-D NIfTI file (dcm2niix)"
         )
     points = points[np.argsort(ranks)]
     step = (points[-1] - points[0]) / (n - 1)
