@@ -23,7 +23,8 @@ mask = tetopt.Image(1.0 * (image.data > 0), image.affine)
 # %%
 # ``tetopt.content`` combines image and mask, and replaces the image in the call.
 
-mesh = tetopt.mesh_image(tetopt.content(image, mask=mask), nodes=3000).mesh
+organ = tetopt.content(image, mask=mask)
+mesh = tetopt.mesh_image(organ, nodes=3000).mesh
 
 # %%
 # Dice compares the voxels inside the mesh with the mask. The distance is from the mesh boundary to the surface halfway
@@ -36,7 +37,7 @@ print(f"Dice {dice:.4f}, boundary off by {fidelity.distance_mean:.2f} voxels on 
 # %%
 # The mesh without one octant, each cell in the grey of its mean.
 
-grid = mesh.to_pyvista({"mean": tetopt.cell_moments(image, mesh).mean})
+grid = mesh.to_pyvista({"mean": tetopt.cell_fields(mesh, organ)["mean"]})
 middle = np.array([0.0, -18.0, 10.0])
 is_cut = (grid.cell_centers().points > middle).all(axis=1)
 opened = grid.extract_cells(np.flatnonzero(~is_cut))

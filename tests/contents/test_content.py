@@ -233,3 +233,22 @@ def test_noise_of_few_slices_of_a_mask_is_noise(monkeypatch):
     data = np.random.default_rng(0).normal(size=(60, 20, 20))
     monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", 1000)  # one slice in 23
     assert noise_level(data, np.ones(data.shape, dtype=bool)) == pytest.approx(1.0, rel=0.2)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_noise_is_of_planes_that_the_mask_has(monkeypatch, n):
+    """Two flat lesions between the sampled slices, one of which has a few voxels of a third without neighbours."""
+    shape = (60, 24, 20)[:n]
+    data, inside = np.random.default_rng(0).normal(0.0, 2.0, shape), np.zeros(shape, dtype=bool)
+    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 14)  # slices 13 apart, from 3
+    inside[8:14] = inside[20:25] = True
+    expected = pytest.approx(2.0, rel=0.3)
+    assert noise_level(data, inside) == expected
+    inside[3, 5] = True
+    assert noise_level(data, inside) == expected
+    for thin in (0, 30, -1):
+        inside[:] = False
+        inside[thin] = True
+        assert noise_level(data, inside) == 0.0
+    mask = tetopt.Image(1.0 * inside)
+    assert tetopt.content(tetopt.Image(data), mask=mask).noise == 0.0

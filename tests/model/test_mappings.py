@@ -69,17 +69,17 @@ def test_a_function_equal_to_a_table_gives_the_same():
         (
             [(0, -1), (10, 9)],
             "modulus: expected 0 kPa or more, got 1 invalid values, such as -1 at intensity 0; "
-            "give a modulus mapping (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
         ),
         (
             lambda h: 4.0 - h,
             "modulus: expected 0 kPa or more, got 2 invalid values, such as -1 at intensity 5, -6 at intensity 10; "
-            "give a modulus mapping (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
         ),
         (
             lambda h: np.where(h > 5, np.inf, 1.0),
             "modulus: expected 0 kPa or more, got 1 invalid values, such as inf at intensity 10; "
-            "give a modulus mapping (`young`) that is positive over the image's range",
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
         ),
         (
             lambda h: h.sum(),

@@ -8,8 +8,9 @@ from typing import Annotated
 from rich.markup import escape
 
 from tetopt.cli.console import out, show_event
-from tetopt.cli.options import MeshArgument, NumberOptions
+from tetopt.cli.options import NumberOptions, mesh_and_image
 from tetopt.cli.solver import print_model
+from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
@@ -18,12 +19,17 @@ from tetopt.system.files import checked_output
 
 
 def convert_command(
-    mesh_path: MeshArgument,
-    output: Annotated[Path, Option("OUT", f"The file to write: {', '.join(FORMATS)}.", is_argument=True)],
+    paths: Annotated[
+        list[Path],
+        Option(
+            "[IMAGE] MESH OUT",
+            f"The mesh, and the file to write: {', '.join(FORMATS)}. An image before them is that of `image`.",
+            is_argument=True,
+        ),
+    ],
     image_path: Annotated[
         Path | None, Option("IMAGE", "Apply mappings to this image, not to the mesh file's means.", "image")
     ] = None,
-    mask_path: Annotated[Path | None, Option("MASK", "With `image`: use only voxels in the mask.", "mask")] = None,
     results_path: Annotated[
         Path | None,
         Option("JOB.frd", "Add CalculiX's results for this mesh (VTK formats only).", "results"),
@@ -34,13 +40,15 @@ def convert_command(
     numbers: NumberOptions,
 ) -> int:
     """Write a mesh for a solver, with materials, named sets and loads, in the format of OUT's suffix."""
+    if len(paths) < 2:
+        raise InputError(f"expected MESH and OUT, the file to write, got only {paths[0]}")
+    mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
+    output = paths[-1]
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     numbers.check()
     with listened(_show):
-        came = convert_file(
-            mesh_path, output, solver=solver, part=part, image=image_path, mask=mask_path, results=results_path
-        )
+        came = convert_file(mesh_path, output, solver=solver, part=part, image=image_path, results=results_path)
     numbers.save(came.numbers)
     print_model(output, came.model, came.options)
     return 0

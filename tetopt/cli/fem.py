@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import print_wide
-from tetopt.cli.options import NumberOptions
+from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.job.solve import PAPER_PERCENT, SolvedModel, solve_file
@@ -24,14 +24,11 @@ SHOWN_FRACTION = 1e-9  # of a force's largest component: less is the residual of
 
 
 def fem_command(
-    paths: Annotated[
-        list[Path],
-        Option(
-            "[IMAGE] MESH",
-            "VTU, VTK or MSH file. IMAGE, to which mappings apply, is optional if the file has moduli and loads.",
-            is_argument=True,
-        ),
-    ],
+    paths: FilesArgument,
+    image_path: Annotated[
+        Path | None,
+        Option("IMAGE", "Apply mappings to this image; optional if the file has moduli and loads.", "image"),
+    ] = None,
     compress: Annotated[
         float | None,
         Option("PERCENT", f"Push the bottom in by PERCENT, top fixed (default {PAPER_PERCENT:g} with an IMAGE)."),
@@ -58,16 +55,14 @@ def fem_command(
     With IMAGE and without loads, this is the paper's test: the face of the image's box with the largest z (y in 2-D)
     is fixed and the opposite face pushed in, both bonded; without --young the intensities are the moduli.
     """
-    if len(paths) > 2:
-        raise InputError(f"expected [IMAGE] MESH, got {len(paths)} files")
-    *images, mesh_path = paths
+    mesh_path, image_path = mesh_and_image(paths, image_path)
     numbers.check()
     if output is not None:
         output = checked_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
         raise InputError("--sets: no file is written; add -o SOLVED.vtu")
     came = solve_file(
-        mesh_path, images[0] if images else None, output, model=model, part=part, compress=compress,
+        mesh_path, image_path, output, model=model, part=part, compress=compress,
         conditioning=conditioning,
     )  # fmt: skip
     _print(mesh_path.name, came)

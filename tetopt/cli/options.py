@@ -17,6 +17,7 @@ from typing import Annotated, Any, cast, get_args, get_type_hints
 import typer
 
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
+from tetopt.errors import InputError
 from tetopt.job.job import of_option
 from tetopt.job.options import (
     IMAGE_FILES,
@@ -34,6 +35,14 @@ from tetopt.system.files import checked_output, name_files, save_json
 ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
     Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra or triangles.", is_argument=True)
+]
+FilesArgument = Annotated[
+    list[Path],
+    Option(
+        "[IMAGE] MESH",
+        "VTU, VTK or gmsh MSH file of tetrahedra or triangles; an image before it is that of `image`.",
+        is_argument=True,
+    ),
 ]
 PredictOption = Annotated[bool, Option(None, "Predict the run's time and memory, and write nothing.")]
 
@@ -72,6 +81,15 @@ class ShownOptions:
         Option("LOW,HIGH", "Range of the field's colours (default: all but 1 % at either end).", "range"),
     ] = None
     label_names: LabelNamesOption = None
+
+
+def mesh_and_image(files: list[Path], image: Path | None) -> tuple[Path, Path | None]:
+    """Return the mesh and the image of a command with files "[IMAGE] MESH" and the option `image`."""
+    *images, mesh = files
+    images += [] if image is None else [image]
+    if len(images) > 1:
+        raise InputError(f"expected MESH and one image (`image`), got {len(images) + 1} files")
+    return mesh, images[0] if images else None
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:

@@ -9,18 +9,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from tetopt.cli.console import out, print_fidelity
-from tetopt.cli.options import NumberOptions
+from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.job.judge import Judgement, judge
-from tetopt.job.options import ImagePart, LabelNamesOption, Option
+from tetopt.job.options import ImagePart, LabelNamesOption, MaskPart, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
 from tetopt.report.tables import add_quality, new_table
 
 
 def quality_command(
-    mesh: Annotated[Path, Option("MESH", "VTU, VTK or MSH file of tetrahedra or triangles.", is_argument=True)],
+    paths: FilesArgument,
     image: Annotated[Path | None, Option("IMAGE", "Also measure E_D against this image.")] = None,
-    mask: Annotated[Path | None, Option("MASK", "Compare the boundary with this mask; needs `image`.")] = None,
     labels: Annotated[Path | None, Option("LABELS", "Compare cells with these labels; needs `image`.")] = None,
     check: Annotated[
         bool,
@@ -33,11 +32,13 @@ def quality_command(
     label_names: LabelNamesOption = None,
     *,
     part: ImagePart,
+    region: MaskPart,
     numbers: NumberOptions,
 ) -> int:
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     numbers.check()
-    came = judge(mesh, image, mask, labels, part=part, label_names=label_names, check=check)
+    mesh, image = mesh_and_image(paths, image)
+    came = judge(mesh, image, region.mask, labels, part=part, label_names=label_names, check=check)
     numbers.save(came.numbers)
     size, source = came.numbers["size"], came.source
     table = new_table("", escape(mesh.name))

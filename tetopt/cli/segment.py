@@ -6,29 +6,31 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 
 import tetopt
-from tetopt import Image, InputError, Mesh, save_image
+from tetopt import Content, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
-from tetopt.cli.options import ImageArgument, NumberOptions
+from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.energy.sampling import overlap_of
-from tetopt.job.inputs import read_image, read_labels, read_mesh, warn_of_other_image
-from tetopt.job.options import ImagePart, Option
+from tetopt.job.inputs import content_within, read_labels, read_mesh, warn_of_other_image
+from tetopt.job.options import ImagePart, MaskPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.files import checked_output
 
 
 def segment_command(
-    image_path: ImageArgument,
-    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or MSH file of the image's mesh.", is_argument=True)],
+    paths: FilesArgument,
     output: Annotated[Path, Option("LABELS.nii.gz", "The labels to write.", letter="o")],
     classes: Annotated[int, Option("K", "Number of classes, in order of increasing mean.", least=2)] = 4,
     truth_path: Annotated[
         Path | None, Option("LABELS", "True labels; prints the Dice overlap with them.", "truth")
     ] = None,
+    image_path: Annotated[Path | None, Option("IMAGE", "The image to segment.", "image")] = None,
     *,
     part: ImagePart,
+    region: MaskPart,
     numbers: NumberOptions,
 ) -> int:
     """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and label their voxels."""
@@ -36,15 +38,19 @@ def segment_command(
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
     numbers.check()
-    image = read_image(image_path, part)
+    mesh_path, image_path = mesh_and_image(paths, image_path)
+    if image_path is None:
+        raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
+    loaded = read_mesh(mesh_path)
+    what = content_within(image_path, part, region, loaded)
+    image, mesh = what.given, loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
-    mesh = _mesh_over(mesh_path, image, image_path)
-    labels = segment(image, mesh, classes)
-    fractions = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
-    means = [
-        float(image.data[labels.data == number].mean()) if fraction else None
-        for number, fraction in enumerate(fractions)
-    ]
+    warn_of_other_image(loaded, mesh_path, image_path)
+    inside = _voxels_in(mesh, what, mesh_path, image_path)
+    labels = segment(what, mesh, classes)
+    of_class, h = labels.data[inside].astype(np.int64), image.data[inside]
+    fractions = np.bincount(of_class, minlength=classes) / len(of_class)
+    means = [float(h[of_class == number].mean()) if fraction else None for number, fraction in enumerate(fractions)]
     report: dict[str, Any] = {
         "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "fraction_of_voxels": fractions,
         "mean_intensity": means,
@@ -56,7 +62,7 @@ def segment_command(
         table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
     overlaps = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
     if truth_path is not None and truth is not None:
-        by_mesh, by_voxels = dice(labels, truth), dice(thresholded(image, classes), truth)
+        by_mesh, by_voxels = dice(labels, truth), dice(thresholded(image, classes, inside), truth)
         overlap = {"mesh": by_mesh, "voxels": by_voxels}
         report |= {"truth": truth_path.name, "stands_for": names, "dice": overlap}
         if lost := [str(label) for label in by_mesh if label not in names.values()]:
@@ -72,15 +78,22 @@ def segment_command(
     return 0
 
 
-def _mesh_over(path: Path, image: Image, image_path: Path) -> Mesh:
-    """Read a mesh whose cells contain each of the image's voxels at most once; warn of voxels outside."""
-    loaded = read_mesh(path)
-    warn_of_other_image(loaded, path, image_path)
-    if (overlap := overlap_of(image, loaded.mesh)) is not None:
+def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> NDArray[np.bool_]:
+    """Return which voxels lie in the mesh and its mask; warn of those outside.
+
+    Raises InputError if one lies in several cells, or all outside.
+    """
+    image = what.given
+    if (overlap := overlap_of(image, mesh)) is not None:
         raise InputError(f"{path}: {overlap}; remove one cell of each pair, or mesh the image again")
-    outside = int((tetopt.cell_of_voxel(image, loaded.mesh) < 0).sum())
+    inside = tetopt.cell_of_voxel(image, mesh) >= 0
+    outside = int((~inside).sum())
     if outside == image.data.size:
         raise InputError(f"{path}: the mesh contains no voxel of {image_path}; was it built from another image?")
     if outside:
         show_warning(f"{outside} of {image.data.size} voxels lie outside the mesh and get class 0")
-    return loaded.mesh
+    if what.continuation is not None:
+        masked = np.zeros_like(inside)
+        masked[what.continuation.part] = what.continuation.inside
+        inside &= masked
+    return inside

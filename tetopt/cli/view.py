@@ -15,9 +15,9 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import out
-from tetopt.cli.options import ForceOption, ShownOptions
-from tetopt.job.inputs import label_table, number_of, read_image, read_mesh, table_in, warn_of_other_image
-from tetopt.job.options import BoxPart, Option
+from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
+from tetopt.job.inputs import content_within, label_table, number_of, read_mesh, warn_of_other_image
+from tetopt.job.options import BoxPart, ImagePart, MaskPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
@@ -26,13 +26,14 @@ from tetopt.system.incoming import json_of
 
 
 def view_command(
-    mesh_path: Annotated[Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra.", is_argument=True)],
+    paths: FilesArgument,
     image_path: Annotated[
         Path | None, Option("IMAGE", "Show this image's slice behind the mesh's section.", "image")
     ] = None,
     *,
     how: ShownOptions,
     part: BoxPart,
+    region: MaskPart,
     force: ForceOption = False,
 ) -> int:
     """View a mesh or its results in the browser: cut, colour by any field, threshold, deform.
@@ -42,16 +43,16 @@ def view_command(
     html = None if how.html is None else checked_output(how.html, (".html",), force)
     screenshot = None if how.screenshot is None else checked_output(how.screenshot, (".png",), force)
     limits = None if how.limits is None else _limits(how.limits)
+    mesh_path, image_path = mesh_and_image(paths, image_path)
     loaded = read_mesh(mesh_path)
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None
     if image_path is not None:
-        image = read_image(image_path, part)
-        if image.ndim != mesh.ndim:
-            raise InputError(f"{image_path}: expected a {mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
+        what = content_within(image_path, ImagePart(**vars(part)), region, loaded)
+        image = what.given
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
-            fields = cell_fields(mesh, image) | fields
+            fields = cell_fields(mesh, what) | fields
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
@@ -97,7 +98,7 @@ def _only_labels(loaded: MeshFile) -> str | None:
 
     A mesh with results on its nodes opens with these.
     """
-    weights = table_in(loaded, "inputs").get("weights")
+    weights = loaded.table("inputs").get("weights")
     are_alone = isinstance(weights, list) and len(weights) > 0 and not any(weights)
     return "label" if are_alone and "label" in loaded.cell_data and not loaded.point_data else None
 

@@ -90,6 +90,8 @@ class Content(NamedTuple):
         Keep connected components of a mesh that the mask does not have.
     statistics : Statistics, optional
         Statistics of the image, if a pass over its voxels has computed them.
+    whole : Image, optional
+        The first contrast as given, if `image` is another: a part of it, with other values beyond the mask, or divided.
 
     Examples
     --------
@@ -109,6 +111,22 @@ class Content(NamedTuple):
     smooth: SmoothLabels | None = None
     keeps_components: bool = False
     statistics: Statistics | None = None
+    whole: Image | None = None
+
+    @property
+    def given(self) -> Image:
+        """The first contrast as given."""
+        return self.image if self.whole is None else self.whole
+
+    @property
+    def own(self) -> Image:
+        """The first contrast on its own voxels, continued beyond the mask, around which alone voxels are kept."""
+        return continued(self.given, None if self.whole is None else self.continuation)
+
+    @property
+    def own_mask(self) -> Image | None:
+        """The mask on the voxels of `own`, 0 and 1; None for the image's box."""
+        return None if self.continuation is None else Image(self.continuation.inside, self.own.affine)
 
     @property
     def memberships(self) -> Memberships | None:
@@ -239,7 +257,7 @@ def content(
     tissues = _checked_tissues(tissues, labels)
     others = {f"tissues, number {number}": tissue for number, tissue in enumerate(tissues, 1)}
     _check(images, {"labels": labels, "mask": mask, **others}, weights, label_weight, smooth_interfaces)
-    region = beyond = None
+    region, beyond, whole = None, None, images[0]
     if mask is not None:
         beyond = continuation(mask, images[0].spacing)
         region = region_of(_part(mask, beyond.part))
@@ -251,7 +269,7 @@ def content(
         where = "" if mask is None else " in the meshed region"
         raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        return plain(images[0])._replace(region=region, continuation=beyond, keeps_components=keep_components)
+        return Content(images[0], region=region, continuation=beyond, keeps_components=keep_components, whole=whole)
     members = None
     if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
         factors = supersampling(labels.spacing)
@@ -270,8 +288,9 @@ def content(
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(
-        images[0], values, len(contrasts), unit / scale**2, region, beyond, keeps_components=keep_components
-    )
+        images[0], values, len(contrasts), unit / scale**2, region, beyond, keeps_components=keep_components,
+        whole=whole,
+    )  # fmt: skip
     if members is None:
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)
@@ -336,6 +355,11 @@ def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> l
 def plain(image: Image | Content) -> Content:
     """Content of a single image; a content is returned unchanged."""
     return image if isinstance(image, Content) else Content(image)
+
+
+def own_image(image: Image | Content) -> Image:
+    """Return the first contrast of a content on its own voxels, see `Content.own`; an image is returned unchanged."""
+    return image.own if isinstance(image, Content) else image
 
 
 def _variance(values: NDArray, region: Region | None) -> float:

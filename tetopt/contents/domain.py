@@ -7,13 +7,17 @@ of a voxel. Between voxel centres the function is linear along each axis.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import base64
+import zlib
+from math import prod
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tetopt.image import Image
+from tetopt.system.budget import check_memory
 
 INSIDE_FRACTION = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
 SMOOTHING_VOXELS = 1.0  # sigma of the Gaussian that smooths the stairs of voxels
@@ -56,3 +60,40 @@ def region_of(mask: Image) -> Region:
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:
     """The level function at index coordinates (K, n), (K,)."""
     return np.asarray(scipy.ndimage.map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64))
+
+
+def mask_text(mask: Image) -> dict[str, Any]:
+    """Return the voxels of 0.5 or more for the header of a mesh's file, in the box around them; `mask_of` reads it."""
+    inside = mask.data >= INSIDE_FRACTION
+    around = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
+    part = mask.box([s.start for s in around], [s.stop for s in around])
+    packed = zlib.compress(np.packbits(inside[around]).tobytes(), 9)
+    return {
+        "shape": list(part.shape),
+        "affine": part.affine.tolist(),
+        "inside": base64.b64encode(packed).decode("ascii"),
+    }
+
+
+def mask_of(text: dict[str, Any]) -> Image:
+    """Return the mask that `mask_text` describes, on its own voxels.
+
+    Raises
+    ------
+    ValueError, TypeError or KeyError
+        The text is not such a description.
+    """
+    shape = tuple(map(int, text["shape"]))
+    if min(shape) < 1:
+        raise ValueError(f"expected voxels along each axis, got {shape}")
+    n_bytes = -(-prod(shape) // 8)
+    check_memory(64.0 * n_bytes, f"mask: {prod(shape)} voxels", "close other programs")
+    unpacking = zlib.decompressobj()
+    try:
+        bits = unpacking.decompress(base64.b64decode(text["inside"], validate=True), n_bytes + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if len(bits) != n_bytes:
+        raise ValueError(f"expected {n_bytes} bytes of voxels")
+    inside = np.unpackbits(np.frombuffer(bits, dtype=np.uint8), count=prod(shape)).reshape(shape)
+    return Image(inside, np.array(text["affine"], dtype=np.float64))

@@ -27,11 +27,22 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
     Structure wider than a voxel cancels in (1, -2, 1) along all axes (Immerkaer 1996, here in n-D), and the lower
     quartile of the magnitude is that of noise in most of the volume. A constant background is ignored; differences in
     less than a tenth of the voxels are edges, not noise, and labels have none. Smoothed noise is underestimated. With
-    `inside` only voxels there, with all neighbours inside, are used. A large image is sampled at about `NOISE_VOXELS`,
-    in slices an odd number apart along the first axis: for four real volumes this was within 0.7 % of the estimate from
-    all voxels, and equal to the last bit for whole numbers.
+    `inside` only voxels there, with all neighbours inside, are used; without any, as in a mask of one plane, the noise
+    is 0. A large image is sampled at about `NOISE_VOXELS`, in slices an odd number apart along the first axis: for four
+    real volumes this was within 0.7 % of the estimate from all voxels, and equal to the last bit for whole numbers. If
+    no such slice has a voxel to use, as many of those with most of them are sampled instead.
     """
-    return sampled_noise(noise_sample(data), None if inside is None else noise_sample(inside).near)
+    if inside is None or min(inside.shape) < 3:
+        return sampled_noise(noise_sample(data))
+    middles = noise_places(inside.shape)[1]
+    if not _surrounded(_near(inside, middles)).any():
+        within = scipy.ndimage.minimum_filter(inside, size=3)[(slice(1, -1),) * inside.ndim]
+        counts = within.sum(axis=tuple(range(1, inside.ndim)))
+        if not counts.any():
+            return 0.0
+        most = np.argsort(-counts, kind="stable")[: len(middles)]
+        middles = 1 + np.sort(most[counts[most] > 0])
+    return sampled_noise(noise_sample(data, middles), _near(inside, middles))
 
 
 def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
@@ -45,10 +56,21 @@ def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
     return max(size // SAMPLED_VOXELS, 1), np.arange(first, end, step, dtype=np.int64)
 
 
-def noise_sample(data: NDArray) -> NoiseSample:
-    """The sample of voxels in memory."""
-    stride, middles = noise_places(data.shape)
-    return NoiseSample(data.ravel()[::stride], np.stack([data[middles + k] for k in (-1, 0, 1)]))
+def noise_sample(data: NDArray, middles: NDArray[np.int64] | None = None) -> NoiseSample:
+    """The sample of voxels in memory; second differences are taken at the planes `middles`, if given."""
+    stride, usual = noise_places(data.shape)
+    return NoiseSample(data.ravel()[::stride], _near(data, usual if middles is None else middles))
+
+
+def _near(data: NDArray, middles: NDArray[np.int64]) -> NDArray:
+    """Planes with the ones before and after, (3, P, ...)."""
+    return np.stack([data[middles + k] for k in (-1, 0, 1)])
+
+
+def _surrounded(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Voxels of the middle planes, but for those at their borders, with all neighbours inside, (P, ...)."""
+    middle = (slice(None), *(slice(1, -1),) * (near.ndim - 2))
+    return np.asarray(scipy.ndimage.minimum_filter(near.all(axis=0), (1, *(3,) * (near.ndim - 2)))[middle])
 
 
 def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) -> float:
@@ -68,7 +90,7 @@ def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) 
     n_voxels = rest.size
     if inside is not None:
         n_voxels = int(inside[1].sum())
-        is_counted &= scipy.ndimage.minimum_filter(inside.all(axis=0), (1, *(3,) * (at.ndim - 1)))[middle]
+        is_counted &= _surrounded(inside)
     size = np.abs(rest[is_counted])
     if np.count_nonzero(size) < 0.1 * n_voxels:
         return 0.0

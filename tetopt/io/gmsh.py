@@ -30,6 +30,7 @@ tetopt's own reader uses them, see `own_comments`.
 
 from __future__ import annotations
 
+import json
 import re
 from itertools import pairwise
 from typing import NamedTuple
@@ -52,6 +53,7 @@ from tetopt.io.tags import (
 )
 from tetopt.io.text import comment_lines, names_apart, rows
 from tetopt.model.fields import node_field
+from tetopt.model.file import MASK_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 
@@ -67,7 +69,7 @@ class OwnComments(NamedTuple):
     """The comments of a file of tetopt's."""
 
     space: str
-    texts: dict[str, str]  # "units", "image", "image_sha256", if known
+    texts: dict[str, str]  # "units", "image", "image_sha256", "mask", if known
     constants: dict[str, tuple[float, float]]  # young and nu of each material defined by entities
     cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
     facets: dict[str, list[int]]  # entities of each facet set
@@ -93,6 +95,8 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
             for name in match[3].split():
                 entities[match[1]].setdefault(name, []).append(int(match[2]))
+        elif match := re.fullmatch(r"mask: (\{.*\})", line):
+            texts[MASK_TEXT] = match[1]
         elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
             zero = int(match[1])
     space = "lps" if coordinates[0].startswith("coordinates: LPS") else "ras"
@@ -125,7 +129,8 @@ def gmsh41(model: Model) -> bytes:
         grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
     parts = [_by_entity(part) for part in _parts(grouped)]
-    comments = [*remarks(model if labels is not None else grouped), *comments, *_entity_comments(model, parts)]
+    remarked = [*remarks(model if labels is not None else grouped), *_mask_comments(model)]
+    comments = [*remarked, *comments, *_entity_comments(model, parts)]
     counts = {part.dim: len(part.groups_of) for part in parts}
     n_elements = sum(len(part.numbers) for part in parts)
     return _file(
@@ -171,7 +176,12 @@ def gmsh22(model: Model) -> bytes:
     parts = _parts(model)
     return _file(
         "2.2 0 8",
-        [*remarks(model), *without_data(without_labels(model)), *_entity_comments(model, parts)],
+        [
+            *remarks(model),
+            *_mask_comments(model),
+            *without_data(without_labels(model)),
+            *_entity_comments(model, parts),
+        ],
         parts,
         _section("Nodes", f"{len(points)}\n", rows(np.arange(1, len(points) + 1), points)),
         _section(
@@ -180,6 +190,12 @@ def gmsh22(model: Model) -> bytes:
             *(_element_lines(model, cells, part) for part in parts),
         ),
     )
+
+
+def _mask_comments(model: Model) -> list[str]:
+    """Return the comment on the mask that the mesh was built within, if any."""
+    text = model.about.get(MASK_TEXT)
+    return [] if text is None else [f"mask: {text if isinstance(text, str) else json.dumps(text)}"]
 
 
 def _n_materials(model: Model) -> int:

@@ -9,18 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.align import resample_mask
-from tetopt.contents.content import continued
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
-from tetopt.image import Image
 from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress
-from tetopt.job.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
@@ -30,9 +27,9 @@ from tetopt.job.model import (
     with_chosen_sets,
     without_stale_results,
 )
-from tetopt.job.options import ImagePart, LabelledPart, SolverOptions, stated_part
+from tetopt.job.options import LabelledPart, SolverOptions
 from tetopt.model.fields import is_stress
-from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile, without_results
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, without_results
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, box_text, merged_sets
 from tetopt.report.summary import model_summary, versions
@@ -48,7 +45,7 @@ class Converted(NamedTuple):
 
 def convert_file(
     mesh: Path, output: Path, *, solver: SolverOptions, part: LabelledPart, image: Path | None = None,
-    mask: Path | None = None, results: Path | None = None,
+    results: Path | None = None,
 ) -> Converted:  # fmt: skip
     """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's suffix.
 
@@ -60,8 +57,6 @@ def convert_file(
     part : LabelledPart
     image : Path, optional
         The source of means and mappings, instead of the mesh's file.
-    mask : Path, optional
-        Use only the voxels within it.
     results : Path, optional
         CalculiX's results for this mesh, to be added to it.
 
@@ -72,12 +67,10 @@ def convert_file(
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
         raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
-    needs_image = {"mask": mask, **stated_part(part), "registered": part.registered or None}
-    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
-        raise InputError(f"`{lost[0]}`: needs `image`")
+    check_part(part, image)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
-    loaded = with_labels(loaded, part.labels)
+    loaded = with_labels(loaded, part.labels, part)
     loaded = without_stale_results(loaded, solver) if results is None else _with_results(loaded, results)
     solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
@@ -85,13 +78,12 @@ def convert_file(
         raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
     if not solver.loads and not is_surface:
         solver = replace(solver, loads=loads_of(loaded))
-    about, box = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box
-    voxels: Image | None = None
+    about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
     if image is not None:
-        whole, voxels = _images(image, mask, part, loaded.mesh.ndim)
-        if warn_of_other_image(loaded, mesh, image, None if part.registered else whole):
-            about = {}
-        box = box_of(whole) if box is None else box
+        what = content_within(image, part, part, loaded)
+        if warn_of_other_image(loaded, mesh, image, None if part.registered else what.given):
+            about = texts_of(loaded, is_other=True)
+        voxels, box = what.image, box_of(what.given) if box is None else box
         about |= {"image": image.name, "image_sha256": sha256(image)}
     if box is not None:
         about["box"] = box_text(box)
@@ -102,7 +94,7 @@ def convert_file(
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
-    files |= {} if part.labels is None else {"labels": part.labels.name}
+    files |= {name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None}
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 
@@ -110,7 +102,7 @@ def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool)
     """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and units are unchanged."""
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
     names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
-    return {name: text for name in (*TEXTS_KEPT, *names) if (text := loaded.text(name)) is not None}
+    return texts_of(loaded) | {name: text for name in names if (text := loaded.text(name)) is not None}
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
@@ -147,11 +139,3 @@ def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
     if not form.is_surface:
         note(f"{output}: {form.what} has no quadratic cells; they are written as linear cells")
     return 1
-
-
-def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:
-    """Read the image, and the same continued beyond the mask by the nearest value inside."""
-    whole, beside = image_and_others(path, part)
-    if whole.ndim != ndim:
-        raise InputError(f"{path}: expected a {ndim}-D image like the mesh, got a {whole.ndim}-D one")
-    return whole, continued(whole, None if mask_path is None else beside(mask_path, resample_mask))

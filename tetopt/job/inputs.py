@@ -13,8 +13,16 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS, in_box, is_same_grid, other_box, resample_contrast
-from tetopt.contents.content import SMOOTH_INTERFACES
+from tetopt.contents.align import (
+    SAME_BOX_VOXELS,
+    SAME_GRID_VOXELS,
+    in_box,
+    is_same_grid,
+    other_box,
+    resample_contrast,
+    resample_mask,
+)
+from tetopt.contents.content import SMOOTH_INTERFACES, Content, continuation, continued
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
@@ -24,14 +32,14 @@ from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice, pa
 from tetopt.io.label_tables import LabelTable, load_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
-from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
+from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
-from tetopt.model.file import MeshFile
+from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, own_mask
 from tetopt.model.labels import NO_TABLE, labels_of
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
-from tetopt.system.incoming import json_of, rows_of
+from tetopt.system.incoming import rows_of
 
 OUTSIDE_FRACTION = 0.02  # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
@@ -189,7 +197,53 @@ def read_mesh(path: Path) -> MeshFile:
     return loaded
 
 
-def with_labels(loaded: MeshFile, path: Path | None) -> MeshFile:
+def mask_for(
+    options: MaskPart | SourceOptions, image: Image, beside: Callable[..., Image], loaded: MeshFile | None
+) -> Image | None:
+    """Read the mask of an image's voxels that count: the options', else the one that a mesh's file was built within.
+
+    Warn if the two differ.
+
+    Raises
+    ------
+    InputError
+        The mask cannot be read, or is needed.
+    """
+    if options.mask is None:
+        return None if loaded is None else own_mask(loaded, image)
+    mask = beside(options.mask, resample_mask)
+    own = None if loaded is None or MASK_TEXT not in loaded.field_data else own_mask(loaded, image)
+    n_other = 0 if own is None else int(((own.data >= INSIDE_FRACTION) != (mask.data >= INSIDE_FRACTION)).sum())
+    if n_other:
+        warning(f"{options.mask}: differs in {n_other} voxels from the mask that the mesh was built within")
+    return mask
+
+
+def check_part(part: LabelledPart, image: Path | None) -> None:
+    """Raise InputError for options that select the voxels of an image if there is none."""
+    needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
+    needs_image |= {"mask": part.mask} if part.labels is None else {}
+    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
+        raise InputError(f"`{lost[0]}`: needs `image`")
+
+
+def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshFile) -> Content:
+    """Read the image of a mesh's file: `whole`, and as `image` continued beyond the mask of the voxels that count.
+
+    Raises
+    ------
+    InputError
+        As for `mask_for`; the image's dimension differs from the mesh's.
+    """
+    whole, beside = image_and_others(path, part)
+    if whole.ndim != loaded.mesh.ndim:
+        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
+    mask = mask_for(options, whole, beside, loaded)
+    beyond = None if mask is None else continuation(mask, whole.spacing)
+    return Content(continued(whole, beyond), continuation=beyond, whole=whole)
+
+
+def with_labels(loaded: MeshFile, path: Path | None, options: MaskPart) -> MeshFile:
     """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
     if path is None:
         return loaded
@@ -197,8 +251,13 @@ def with_labels(loaded: MeshFile, path: Path | None) -> MeshFile:
     check_labels(str(path), labels)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
+
+    def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
+        return aligned(read_companion(other), labels, str(other))
+
     try:
-        return loaded._replace(cell_data={**loaded.cell_data, "label": cell_labels(labels, loaded.mesh)})
+        counted = continued(labels, mask_for(options, labels, beside, loaded))
+        return loaded._replace(cell_data={**loaded.cell_data, "label": cell_labels(counted, loaded.mesh)})
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -249,15 +308,6 @@ def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
     return ", ".join(map(str, names[:most])) + more
 
 
-def table_in(loaded: MeshFile, name: str) -> dict[str, Any]:
-    """Return a table from the texts of a mesh's file; empty if it is missing or another program's."""
-    try:
-        table = json_of(loaded.text(name) or "{}")
-    except ValueError:
-        return {}
-    return table if isinstance(table, dict) else {}
-
-
 def warn_of_other_image(
     loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image | None = None, *, is_exact: bool = False
 ) -> bool:
@@ -278,6 +328,12 @@ def warn_of_other_image(
     if is_other:
         warning(f"{mesh_path} was built from a different image, not {image_path}")
     return is_other
+
+
+def texts_of(loaded: MeshFile, *, is_other: bool = False) -> dict[str, Any]:
+    """Return the texts of a mesh's file to keep in another file; with another image, only that on the mesh's mask."""
+    kept = (MASK_TEXT,) if is_other else TEXTS_KEPT
+    return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
 
 def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:

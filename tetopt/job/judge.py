@@ -15,14 +15,14 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import violated, warning
-from tetopt.job.inputs import label_table, read_companion, read_mesh, table_in, warn_of_other_image
+from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
 from tetopt.measure.quality import Quality, quality
 from tetopt.measure.requirements import judged
-from tetopt.model.file import MeshFile
+from tetopt.model.file import MASK_TEXT, MeshFile
 from tetopt.report.summary import fidelity, size_summary
 
 
@@ -38,25 +38,27 @@ class Judgement(NamedTuple):
     fit: ImageFit | None = None
     result: MeshingResult | None = None  # the mesh as the result of a run, with violated requirements
     measured: dict[str, Any] = {}  # noqa: RUF012 - fit to mask, labels and contrasts; never modified
+    is_compared: bool = True  # with the mask; the mesh's file does not contain the fractions of one
 
     @property
     def is_masked(self) -> bool:
         """True if the mesh was built within a mask or without a background."""
-        inputs = table_in(self.loaded, "inputs")
-        was_masked = inputs.get("mask") is not None or inputs.get("background") is not None
-        return was_masked or (self.source is not None and self.source.mask is not None)
+        inputs = self.loaded.table("inputs")
+        was_masked = any(inputs.get(name) is not None for name in ("mask", "background"))
+        is_masked = self.source is not None and self.source.mask is not None
+        return was_masked or is_masked or MASK_TEXT in self.loaded.field_data
 
     @property
     def is_filled(self) -> bool:
         """True if the mesh should fill the image's box: neither built within a mask nor from another mesh."""
-        return not self.is_masked and table_in(self.loaded, "options").get("start") is None
+        return not self.is_masked and self.loaded.table("options").get("start") is None
 
     @property
     def left_out(self) -> list[str]:
         """Inputs of the run that built the mesh which are missing here."""
         if self.source is None:
             return []
-        inputs, there = table_in(self.loaded, "inputs"), {"mask": self.source.mask, "labels": self.source.labels}
+        inputs, there = self.loaded.table("inputs"), {"mask": self.source.mask, "labels": self.source.labels}
         left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
         left_out += ["tissues"] * (self.source.labels is None and inputs.get("tissues") is not None)
         images = inputs.get("images")
@@ -65,7 +67,7 @@ class Judgement(NamedTuple):
     @property
     def requirements(self) -> dict[str, Any]:
         """Requirements of the run that built the mesh, from its file; another program's mesh need only fill the box."""
-        options = table_in(self.loaded, "options")  # only tetopt's have a method
+        options = self.loaded.table("options")  # only tetopt's have a method
         is_kept = options.get("method") == "fast" and options.get("iterations") != 0
         return {
             "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
@@ -119,7 +121,8 @@ def judge(
     if image is not None:
         source = _source(loaded, image, mask, labels, part)
         warn_of_other_image(loaded, mesh, image, source.contrasts[0] if check else None, is_exact=check)
-        judgement = judgement._replace(source=source)
+        has_mask = mask is not None or loaded.table("inputs").get("background") is not None
+        judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
         numbers |= {**measured, "image": image.name, "fit": fit}
@@ -133,19 +136,18 @@ def judge(
 
 def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
-    inputs = table_in(loaded, "inputs")
-    level, tension, weight = (_number(inputs.get(name)) for name in ("background", "smooth_interfaces", "label_weight"))
+    inputs = loaded.table("inputs")
+    tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
         images=[image], mask=mask, labels=labels, **vars(part),
-        background=None if mask is not None or level is None else repr(level),
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
     )  # fmt: skip
-    return read_source(options, numbers=None if labels is None else _merged(inputs, labels))
+    return read_source(options, numbers=None if labels is None else _merged(inputs, labels), loaded=loaded)
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
@@ -169,6 +171,8 @@ def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
+    if not came.is_compared:
+        measured.pop("mask", None)
     if not (source.content.is_plain and source.content.region is None):
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
     return fit, result, measured
@@ -191,7 +195,7 @@ def _checked(came: Judgement) -> tuple[list[str], list[str]]:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
         touching = manifold_problems(mesh, labels)
-    is_smooth = (_number(table_in(came.loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    is_smooth = (_number(came.loaded.table("inputs").get("smooth_interfaces")) or 0.0) > 0.0
     return (touching, []) if is_smooth else ([], touching)
 
 

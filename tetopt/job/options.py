@@ -81,7 +81,17 @@ class ImagePart(BoxPart):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelledPart(ImagePart):
+class MaskPart:
+    """Mask of the voxels that count for a mesh's file."""
+
+    mask: Annotated[
+        Path | None,
+        Option("MASK", "The mask that the mesh was built within, unless its file contains it: no other voxel counts."),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledPart(MaskPart, ImagePart):
     """Selected part of an image file, and labels for a mesh without them."""
 
     labels: Annotated[
@@ -93,7 +103,7 @@ class LabelledPart(ImagePart):
     ] = False
 
 
-WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
+WHOLE_BOX, WHOLE_IMAGE, NO_MASK = BoxPart(), ImagePart(), MaskPart()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -61,11 +61,10 @@ def read(job: Job) -> Task:
 
 def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them."""
-    source = left_source(plan) or read_source(plan.job, plan.job.label_names)
+    begun = None if plan.job.start is None else read_mesh(plan.job.start)
+    source = left_source(plan) or read_source(plan.job, plan.job.label_names, loaded=begun)
     plan.division.check_image(source.content.image)
-    begun = None
-    if plan.job.start is not None:
-        begun = read_mesh(plan.job.start)
+    if begun is not None:
         _check_place(begun.mesh, source.contrasts[0], str(plan.job.start))
         if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed(plan.job, order=2))

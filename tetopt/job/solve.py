@@ -14,7 +14,7 @@ from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import note, warning
-from tetopt.job.inputs import read_image, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
 from tetopt.job.model import (
     check_model_options,
     loads_of,
@@ -76,21 +76,16 @@ def solve_file(
     if image is not None:
         model = replace(model, young=model.young or INTENSITY_MAPPING, average=model.average or DEFAULT_AVERAGE)
     _check_options(image, compress, model, part)
-    voxels = None if image is None else read_image(image, part)
-    loaded = with_labels(without_results(read_mesh(mesh)), part.labels)
-    if image is not None:
-        warn_of_other_image(loaded, mesh, image, None if part.registered else voxels)
-    of_box = voxels is not None and not model.loads
-    if voxels is not None and of_box:
-        _check_box(voxels, loaded)
-    task = _model(loaded, voxels, _filled(model, loaded, voxels, compress))
+    task = _model(mesh, image, model, part, compress)
+    of_box = image is not None and not model.loads
     solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
     if output is not None:
         save_model(output, with_chosen_sets(_with_results(task, solutions), output, model))
     _advise(task, solutions)
     options = {**asdict(model), "compress_percent": compress, **stated_part(part)}
     options["label_names"] = None if model.label_names is None else model.label_names.name
-    files = {"mesh": mesh.name} | ({} if part.labels is None else {"labels": part.labels.name})
+    files = {"mesh": mesh.name}
+    files |= {name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None}
     if image is not None:
         files |= {"image": image.name, "image_sha256": sha256(image)}
     about = {**files, "versions": versions(), "options": options}
@@ -105,11 +100,9 @@ def _check_options(image: Path | None, compress: float | None, model: ModelOptio
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
         raise InputError("`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5")
-    needs_image = {**stated_part(part), "registered": part.registered or None}
-    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
-        raise InputError(f"`{lost[0]}`: needs an IMAGE, got only a mesh")
+    check_part(part, image)
     if image is None and model.average is not None:
-        raise InputError("`average`: averages over an image's voxels; pass the IMAGE before the MESH")
+        raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
 
 
@@ -122,9 +115,7 @@ def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress
     elif not model.loads:
         model = replace(model, loads=loads_of(loaded))
     if model.young is None and "young" not in loaded.cell_data:
-        raise InputError(
-            "the mesh's file has no moduli: pass `young`, such as `young` 3.5, or the IMAGE before the MESH"
-        )
+        raise InputError("the mesh's file has no moduli: pass `young`, such as `young` 3.5, or `image`")
     if not model.loads:
         raise InputError(
             "the mesh's file has no loads: pass `loads`, such as `loads` compress:5%, "
@@ -141,11 +132,20 @@ def _check_box(image: Image, loaded: MeshFile) -> None:
     check_fills_box(image, loaded.mesh)
 
 
-def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Model:
-    """Build the model to solve."""
-    box = loaded.box if image is None else box_of(image)
-    about = {} if box is None else {"box": box_text(box)}
-    return model_of_file(loaded, image, options, about, box, has_units=options.young != INTENSITY_MAPPING)
+def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPart, compress: float | None) -> Model:
+    """Build the model to solve, of the mesh's file and the image."""
+    loaded = with_labels(without_results(read_mesh(path)), part.labels, part)
+    about, box, whole, voxels = texts_of(loaded), loaded.box, None, None
+    if image is not None:
+        what = content_within(image, part, part, loaded)
+        whole, voxels = what.given, what.image
+        about = texts_of(loaded, is_other=warn_of_other_image(loaded, path, image, None if part.registered else whole))
+        if not model.loads:
+            _check_box(whole, loaded)
+        box = box_of(whole)
+    about |= {} if box is None else {"box": box_text(box)}
+    model = _filled(model, loaded, whole, compress)
+    return model_of_file(loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING)
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:

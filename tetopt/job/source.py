@@ -16,9 +16,9 @@ from tetopt.contents.align import (
     foreground,
     resample_contrast,
     resample_labels,
-    resample_mask,
 )
 from tetopt.contents.content import Content, content, continued
+from tetopt.contents.domain import mask_text
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
@@ -31,6 +31,7 @@ from tetopt.job.inputs import (
     image_and_others,
     label_table,
     listed,
+    mask_for,
     number_of,
     tissue_files,
     tissue_volumes,
@@ -40,6 +41,7 @@ from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
+from tetopt.model.file import MASK_TEXT, MeshFile
 from tetopt.model.labels import TABLE_TEXT, label_words, table_of_labels, table_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
@@ -118,11 +120,13 @@ class Source(NamedTuple):
 
 
 def read_source(
-    options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None
+    options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None,
+    loaded: MeshFile | None = None,
 ) -> Source:  # fmt: skip
     """Read images, labels with their names, and mask, on the voxels of the first image.
 
-    Labels get other `numbers` if given; otherwise they are merged by the options and their names.
+    Labels get other `numbers` if given; otherwise they are merged by the options and their names. Without a mask or a
+    background in the options, that of a mesh's file counts, if one was `loaded`.
     """
     paths = options.images
     image, beside = image_and_others(paths[0], options)
@@ -130,9 +134,10 @@ def read_source(
     if labels is not None and is_own and numbers:
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
-    mask = None if options.mask is None else beside(options.mask, resample_mask)
     level = None
-    if options.background is not None:
+    if options.background is None:
+        mask = mask_for(options, image, beside, loaded)
+    else:
         is_auto = options.background == "auto"
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = _foreground(image, level, labels)
@@ -163,6 +168,7 @@ def read_source(
         "image_sha256": checksum(paths[0]),
         "inputs": inputs,
         "box": box_text(box_of(image)),
+        **({} if mask is None else {MASK_TEXT: mask_text(mask)}),
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)

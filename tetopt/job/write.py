@@ -30,6 +30,7 @@ from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.file import MASK_TEXT
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
@@ -130,7 +131,8 @@ def numbers_of(
     """Return every number of a run except measurements: the begin of run.json."""
     source = task.source
     table = _table_of(source)
-    texts = about if table is None else about | {TABLE_TEXT: table_words(table)}
+    texts = {name: text for name, text in about.items() if name != MASK_TEXT}  # which is for the mesh's file
+    texts |= {} if table is None else {TABLE_TEXT: table_words(table)}
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
     summary["image_properties"] = image_summary(source.own)  # on original voxels, not on divided ones
     summary["request"] = task.request
@@ -171,7 +173,7 @@ def draw(task: Task, came: Meshed, model: Model) -> None:
     own = continued(image, source.content.continuation)
     figures.save_run_figures(pictures[:3], own, came.initial, came.result, task.start_name, image)
     of_cell = model.cell_data.get("label")
-    if source.mask is not None:
+    if source.mask is not None and "boundary" in pictures[3].stem:  # none for the mask of a mesh to start from
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, own_image
 from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
@@ -17,13 +18,13 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 
-def segment(image: Image, mesh: Mesh, classes: int) -> Image:
+def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     """Segment an image into classes 0 to classes - 1 of increasing mean, from the classes of its cells.
 
     Parameters
     ----------
-    image : Image
-        The intensities h.
+    image : Image or Content
+        The intensities h. For a mesh of a content, pass the content: voxels outside its mask do not count.
     mesh : Mesh
         Mesh of the image's box or a part of it.
     classes : int
@@ -32,7 +33,7 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     Returns
     -------
     Image
-        Class of each voxel, whole numbers.
+        Class of each voxel, whole numbers; 0 outside the mesh.
 
     Raises
     ------
@@ -47,19 +48,21 @@ def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     >>> int((labels.data != truth.data).sum())  # voxels that differ from the phantom
     20
     """
-    moments = cell_moments(image, mesh)
+    moments = cell_moments(own_image(image), mesh)
     if not moments.n_voxels.any():
         raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
-    owner = cell_of_voxel(image, mesh)
-    return Image(np.where(owner >= 0, class_of_cell[owner], 0), image.affine)
+    whole = image if isinstance(image, Image) else image.given
+    owner = cell_of_voxel(whole, mesh)
+    return Image(np.where(owner >= 0, class_of_cell[owner], 0), whole.affine)
 
 
-def thresholded(image: Image, classes: int) -> Image:
-    """Segment an image into the same classes directly from its voxels, without a mesh."""
-    thresholds = class_thresholds(image.data.ravel(), classes)
-    return Image(np.digitize(image.data, thresholds), image.affine)
+def thresholded(image: Image, classes: int, inside: NDArray[np.bool_] | None = None) -> Image:
+    """Segment an image's voxels, by default all, into the same classes without a mesh; those not `inside` get 0."""
+    inside = np.ones(image.shape, dtype=bool) if inside is None else inside
+    thresholds = class_thresholds(image.data[inside], classes)
+    return Image(np.where(inside, np.digitize(image.data, thresholds), 0), image.affine)
 
 
 def stands_for(labels: Image, truth: Image) -> dict[int, int]:

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, continued
+from tetopt.contents.domain import mask_text
 from tetopt.errors import InputError, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
@@ -15,12 +17,14 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import (
+    MASK_TEXT,
     MATERIAL_FIELDS,
     TEXTS_KEPT,
     MeshFile,
     completed,
     loads_in,
     moduli_in,
+    own_mask,
     sets_beside,
     without_results,
 )
@@ -34,7 +38,7 @@ from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_r
 
 def build_model(
     mesh: Mesh | MeshFile,
-    image: Image | None = None,
+    image: Image | Content | None = None,
     *,
     young: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
     nu: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
@@ -58,8 +62,9 @@ def build_model(
         The contents of a file (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
         nodes, labels and their names, sets, moduli, loads, the image's box, and strings on its origin. Solver results
         are kept if moduli and loads are.
-    image : Image, optional
-        Mappings are applied to its intensities, and the faces of its box become sets.
+    image : Image or Content, optional
+        Mappings are applied to its intensities, and the faces of its box become sets. For a mesh of a content, pass the
+        content: its first contrast counts, and no voxel outside its mask. A MeshFile knows its mask.
     young, nu : number, (M,) array, mapping or str, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one per cell, or
         a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`). With an image, a mapping
@@ -130,6 +135,7 @@ def build_model(
     [2.0, 10.0]
     """
     loaded, loads = None, tuple(loads)
+    image, whole, about = _voxels(image, mesh, about or {})
     if isinstance(mesh, MeshFile):
         loaded, is_of_file = _to_be_kept(mesh, [young, nu, density, bins], loads), young is None and bins is None
         mesh, order = loaded.mesh, loaded.order if order is None else order
@@ -139,7 +145,7 @@ def build_model(
         cell_data = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
         loads = loads or _said(loads_in(loaded))
         box = loaded.box if box is None else box
-        about = _texts_of(loaded, box) | (about or {})
+        about = _texts_of(loaded, box) | about
     order = 1 if order is None else order
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
@@ -148,12 +154,12 @@ def build_model(
         raise InputError(f"image: expected a {mesh.ndim}-D image, like the mesh, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
     labels = labels_of(cell_data, len(mesh.cells))
-    about = _with_table_in_words(about or {}, labels)
+    about = _with_table_in_words(about, labels)
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
     cells = _ModelCells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
     if known_sets is None:
-        box = box_of(image) if box is None and image is not None else box
+        box = box_of(whole) if box is None and whole is not None else box
         known_sets = _sets(cells, box, cell_data, loaded, loads)
     all_sets = with_requested(mesh, known_sets, sets, mean)
     table, nodal, at_gauss = None, None, None
@@ -170,6 +176,17 @@ def build_model(
         density_of(table)  # raises InputError without a density
     model = Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=about)
     return model if loaded is None else _said(completed(model, loaded, is_of_file=is_of_file))
+
+
+def _voxels(
+    image: Image | Content | None, mesh: Mesh | MeshFile, about: dict[str, Any]
+) -> tuple[Image | None, Image | None, dict[str, Any]]:
+    """Return the image with the voxels that count, the whole image, and the file's strings with one on the mask."""
+    if isinstance(image, Content):
+        texts = {} if image.own_mask is None else {MASK_TEXT: mask_text(image.own_mask)}
+        return image.own, image.given, texts | about
+    within = None if image is None or isinstance(mesh, Mesh) else own_mask(mesh, image)
+    return (image if image is None else continued(image, within)), image, about
 
 
 def _said(answer: tuple[Any, str]) -> Any:

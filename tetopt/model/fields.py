@@ -7,6 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, own_image
 from tetopt.energy.sampling import cell_moments_and_ranges
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
@@ -23,15 +24,16 @@ STRESS_FIELDS = ("young", NODE_MODULI, GAUSS_MODULI, "stress", "von_mises", "str
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
-def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
+def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, NDArray]:
     """Return the standard fields of each cell, as written to mesh files.
 
     Parameters
     ----------
     mesh : Mesh
         Points in world coordinates, mm.
-    image : Image, optional
-        Without it, the fields of the image are omitted.
+    image : Image or Content, optional
+        Without it, the fields of the image are omitted. For a mesh of a content, pass the content: voxels outside its
+        mask take the value of the nearest voxel inside.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
     """
     fields: dict[str, NDArray] = {}
     if image is not None:
-        moments, (low, high) = cell_moments_and_ranges(image, mesh)
+        moments, (low, high) = cell_moments_and_ranges(own_image(image), mesh)
         fields |= {"mean": moments.mean, "variance": moments.variance, "n_voxels": moments.n_voxels}
         fields |= {"min": low, "max": high}
     fields["volume"] = volumes(mesh.points, mesh.cells)

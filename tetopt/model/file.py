@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.align import resample_mask
+from tetopt.contents.domain import mask_of
+from tetopt.errors import InputError
+from tetopt.image import Image
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
@@ -21,7 +26,8 @@ from tetopt.system.incoming import json_of
 
 MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # cell data in tetopt's files
 MODULUS_ROUNDING = 1e-9  # relative, between a cell's modulus and those at its Gauss points, in files of other units
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # texts of a mesh's file that are kept in the new one
+MASK_TEXT = "mask"  # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", MASK_TEXT)  # those that are kept in a new file
 
 
 class MeshFile(NamedTuple):
@@ -97,6 +103,33 @@ class MeshFile(NamedTuple):
         """
         return text_in(self.field_data, name)
 
+    def table(self, name: str) -> dict[str, Any]:
+        """Return the table in a string of the field data that is JSON.
+
+        Parameters
+        ----------
+        name : str
+            Name in the field data.
+
+        Returns
+        -------
+        dict
+            Empty if it is missing, or another program's.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+        >>> tetopt.save_mesh("ball.vtu", mesh, about={"options": {"spacing": 8}})
+        >>> tetopt.load_mesh("ball.vtu").table("options")
+        {'spacing': 8}
+        """
+        try:
+            table = json_of(self.text(name) or "{}")
+        except ValueError:
+            return {}
+        return table if isinstance(table, dict) else {}
+
     def _repr_html_(self) -> str:
         """Show the contents of the file in a notebook, with the middle section shaded by cell means."""
         mesh = self.mesh
@@ -120,6 +153,33 @@ def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
     """Return a text from a file's field data, None if it is missing."""
     values = field_data.get(name, np.empty(0))
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
+
+
+def own_mask(loaded: MeshFile, image: Image) -> Image | None:
+    """Return the mask that a mesh's file was built within, on an image's voxels; None for a whole box.
+
+    A region without its background counts as a mask.
+
+    Raises
+    ------
+    InputError
+        The file names a mask but does not contain it; the mask lies outside the image.
+    """
+    if MASK_TEXT in loaded.field_data:
+        mask = None
+        with suppress(ValueError, TypeError, KeyError, OverflowError):  # another program's "mask"
+            mask = mask_of(loaded.table(MASK_TEXT))
+        if mask is not None:
+            return resample_mask(mask, image, "the mesh's own mask")
+    inputs = loaded.table("inputs")
+    name, level = inputs.get("mask"), inputs.get("background")
+    if name is None and level is None:
+        return None
+    name = f"the foreground above {level}" if name is None else f"the mask {name}"
+    raise InputError(
+        f"the mesh was built within {name}, which its file does not contain: pass `mask`, or in Python tetopt.content "
+        "with the mask instead of the image"
+    )
 
 
 def table_in(text: str | None) -> LabelTable:

@@ -101,7 +101,8 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.fl
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as {first}; "
-            "give a modulus mapping (`young`) that is positive over the image's range"
+            f"give a modulus mapping (`young`) that is positive from {intensities.min():g} to {intensities.max():g}, "
+            "or leave out other tissue (`mask`)"
         )
     return young
 

@@ -1,0 +1,133 @@
+"""A mesh built within a mask: no voxel outside counts, in any command and in Python, whatever is passed with it."""
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+
+import tetopt
+from tetopt.model.file import MASK_TEXT
+
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+LAW = "4 + 0.02*max(h,-190)"  # 0.2 in the air around, 10 to 26 in the organ
+
+
+@pytest.fixture(scope="module")
+def organ(tmp_path_factory):
+    """A ball in air, its mask, a mesh within it with moduli, and one without the background."""
+    folder = tmp_path_factory.mktemp("organ")
+    place = np.indices((20, 18, 16)) - np.array([9.5, 8.5, 7.5])[:, None, None, None]
+    inside = (place**2).sum(axis=0) <= 36.0
+    image = tetopt.Image(np.where(inside, 700.0 + 100.0 * place[0], -500.0), np.diag([1.0, 1.0, 1.5, 1.0]))
+    tetopt.save_image(folder / "ct.nii.gz", image)
+    tetopt.save_image(folder / "m.nii.gz", tetopt.Image(1.0 * inside, image.affine))
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(1.0 + inside, image.affine))
+    tetopt.save_image(folder / "t2.nii.gz", tetopt.Image(2.0 * image.data, image.affine))
+    mesh = ["mesh", folder / "ct.nii.gz", "--nodes", "90", "--iterations", "1", "--young", LAW, "--average", "mean"]
+    for name, region in (("a", ["--mask", folder / "m.nii.gz"]), ("b", ["--background", "-400"])):
+        words = [*mesh, *region, "-o", folder / f"{name}.vtu", "--json", folder / f"{name}.json"]
+        assert exit_code(*words, "--figures", folder / name) in (0, 1)
+    return folder
+
+
+def moduli(path):
+    """Those of all cells, ascending: MSH files have the cells by material."""
+    return np.sort(tetopt.load_mesh(path).cell_data["young"])
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_no_voxel_outside_the_mask_counts(organ, tmp_path, name):
+    """Moduli are the run's to the last bit, also after formats that keep the mask, and of results."""
+    expected = moduli(organ / f"{name}.vtu")
+    law = ["--image", organ / "ct.nii.gz", "--young", LAW, "--average", "mean"]
+    first = organ / f"{name}.vtu"
+    for second in ("c.vtk", "d.msh", "e.msh2", "f.vtu"):
+        assert exit_code("convert", first, tmp_path / second, *law) == 0
+        if second != "e.msh2":
+            np.testing.assert_array_equal(moduli(tmp_path / second), expected)
+        first = tmp_path / second
+    loads = ["--load", "compress:1%", "-o", tmp_path / "s.vtu"]
+    assert exit_code("fem", first, *law, *loads) == 0
+    np.testing.assert_array_equal(moduli(tmp_path / "s.vtu"), expected)
+    assert MASK_TEXT in tetopt.load_mesh(tmp_path / "s.vtu").field_data
+    loaded, image = tetopt.load_mesh(organ / f"{name}.vtu"), tetopt.load_image(organ / "ct.nii.gz")
+    mapped = tetopt.build_model(loaded, image, young=LAW, average="mean").materials
+    np.testing.assert_array_equal(np.sort(mapped.young[mapped.of_cell]), expected)
+
+
+def test_a_content_takes_its_mask_along(organ, tmp_path):
+    image, mask = (tetopt.load_image(organ / f"{name}.nii.gz") for name in ("ct", "m"))
+    labels = tetopt.Image(1.0 + (image.data > 700.0), image.affine)
+    loaded = tetopt.load_mesh(organ / "a.vtu")
+    for what in (tetopt.content(image, mask=mask), tetopt.content([image, labels], labels, mask)):
+        model = tetopt.build_model(loaded.mesh, what, young=LAW, average="mean")
+        np.testing.assert_array_equal(np.sort(model.materials.young[model.materials.of_cell]), moduli(organ / "a.vtu"))
+        assert model.sets.facets.keys() == loaded.sets.facets.keys()
+        fields = tetopt.cell_fields(loaded.mesh, what)
+        np.testing.assert_array_equal(fields["mean"], loaded.cell_data["mean"])
+    tetopt.save_model(tmp_path / "m.vtu", model)  # knows it, too
+    words = ["convert", tmp_path / "m.vtu", tmp_path / "n.vtu", "--image", organ / "ct.nii.gz", "--young", LAW]
+    assert exit_code(*words, "--average", "mean") == 0
+    np.testing.assert_array_equal(moduli(tmp_path / "n.vtu"), moduli(organ / "a.vtu"))
+    classes = tetopt.segment(what, loaded.mesh, 2)
+    assert classes.shape == image.shape
+
+
+def test_other_masks_labels_and_images(organ, tmp_path, capsys):
+    """Another mask is warned of; labels count within the mask; a mesh without it needs it, if it knows that."""
+    image = tetopt.load_image(organ / "ct.nii.gz")
+    tetopt.save_image(tmp_path / "other.nii.gz", tetopt.Image(1.0 * (image.data > 800.0), image.affine))
+    convert = ["convert", organ / "a.vtu", tmp_path / "a.vtu", "--force", "--young", LAW]
+    assert exit_code(*convert, "--image", organ / "ct.nii.gz", "--mask", organ / "m.nii.gz") == 0
+    assert "differs" not in capsys.readouterr().err
+    assert exit_code(*convert, "--image", organ / "ct.nii.gz", "--mask", tmp_path / "other.nii.gz") == 0
+    assert "other.nii.gz: differs in " in capsys.readouterr().err
+    assert exit_code(*convert, "--image", organ / "t2.nii.gz") == 0
+    again = tetopt.load_mesh(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(again.cell_data["mean"], 2.0 * tetopt.load_mesh(organ / "a.vtu").cell_data["mean"])
+    assert again.text("image") == "t2.nii.gz"
+    assert MASK_TEXT in again.field_data
+    labels = ["convert", organ / "a.vtu", tmp_path / "l.vtu", "--labels", organ / "l.nii.gz", "--young", "1=1,2=9"]
+    assert exit_code(*labels) == 0
+    assert set(tetopt.load_mesh(tmp_path / "l.vtu").cell_data["label"].tolist()) == {2}
+    lost = tetopt.load_mesh(organ / "a.vtu")
+    tetopt.save_mesh(tmp_path / "lost.vtu", lost.mesh, about={"inputs": lost.text("inputs")})
+    capsys.readouterr()
+    with_image = ["--image", organ / "ct.nii.gz"]
+    for words in (
+        ["convert", tmp_path / "lost.vtu", tmp_path / "no.vtu"], ["quality", tmp_path / "lost.vtu"],
+        ["fem", tmp_path / "lost.vtu"], ["view", tmp_path / "lost.vtu", "--html", tmp_path / "no.html"],
+        ["segment", tmp_path / "lost.vtu", "-o", tmp_path / "no.nii"],
+        ["mesh", organ / "ct.nii.gz", "--start", tmp_path / "lost.vtu", "-o", tmp_path / "no.vtu"],
+    ):  # fmt: skip
+        assert exit_code(*words, *([] if words[0] == "mesh" else with_image)) == 2
+        assert "the mesh was built within the mask m.nii.gz, which its file does not contain" in capsys.readouterr().err
+    with pytest.raises(tetopt.InputError, match="pass `mask`"):
+        tetopt.build_model(tetopt.load_mesh(tmp_path / "lost.vtu"), image, young=LAW)
+    words = ["fem", tmp_path / "lost.vtu", *with_image, "--mask", organ / "m.nii.gz", "--young", LAW]
+    assert exit_code(*words, "--average", "mean", "--load", "compress:1%", "-o", tmp_path / "s.vtu") == 0
+    np.testing.assert_array_equal(moduli(tmp_path / "s.vtu"), moduli(organ / "a.vtu"))
+
+
+def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):
+    words = ["mesh", organ / "ct.nii.gz", "--start", organ / "a.vtu", "--iterations", "0", "--young", LAW]
+    out = ["--average", "mean", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--figures", tmp_path]
+    assert exit_code(*words, *out) == 0
+    np.testing.assert_array_equal(moduli(tmp_path / "a.vtu"), moduli(organ / "a.vtu"))
+    assert numbers_in(tmp_path / "a.json")["mask"] == pytest.approx(numbers_in(organ / "a.json")["mask"])
+    assert not (tmp_path / "boundary.png").exists()
+
+
+@pytest.mark.parametrize("command", ["quality", "fem", "segment", "view", "convert"])
+def test_the_image_before_the_mesh_or_as_an_option(organ, tmp_path, command, capsys):
+    image, mesh = organ / "ct.nii.gz", organ / "a.vtu"
+    more = {
+        "fem": ["--load", "compress:1%"], "segment": ["-o", tmp_path / "a.nii", "--force"],
+        "view": ["--html", tmp_path / "a.html", "--force"], "convert": [tmp_path / "a.vtu", "--force"], "quality": [],
+    }[command]  # fmt: skip
+    printed = []
+    for words in ([image, mesh, *more], [mesh, *more, "--image", image]):
+        assert exit_code(command, *words) in (0, 1)
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert exit_code(command, image, mesh, *more, "--image", image) == 2
+    assert "expected MESH and one image (--image), got 3 files" in capsys.readouterr().err
