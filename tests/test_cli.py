@@ -385,7 +385,7 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines()[-3:] == [
-        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to discard it)",
+        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end at once)",
         "interrupted again: unwritten results are discarded",
         "ended by Ctrl-C; written: nothing",
     ]

@@ -8,8 +8,10 @@ from commands import exit_code, numbers_in
 from models import sample_image
 
 import tetopt
+from tetopt.engine.fast import Run
 from tetopt.io.formats import FORMATS
 from tetopt.job.events import listened, note
+from tetopt.job.source import Source
 
 pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 
@@ -167,3 +169,39 @@ def test_the_library_prints_nothing(inputs, tmp_path, capfd):
         warnings.simplefilter("ignore")
         tetopt.run(job)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".inp", ".feb"])
+def test_a_run_cut_short_writes_its_mesh_before_anything_else(tmp_path, monkeypatch, suffix):
+    """Before cells are lifted and measured, which takes minutes for many; FEBio takes no mesh without moduli."""
+    phantom = tetopt.load_phantom("sphere")
+    tetopt.save_image(tmp_path / "a.nii", phantom.image(voxel_mm=4))
+    tetopt.save_image(tmp_path / "l.nii", phantom.label_image(voxel_mm=4))
+    asks, seen, mend, fields = [], [], Run.mend, Source.fields
+
+    def stop():
+        asks.append(True)
+        return len(asks) > 3
+
+    def looked():
+        if len(asks) <= 3:  # as kernels are prepared, and the initial mesh is tried
+            return
+        place = tmp_path / ("out.vtu" if suffix == ".feb" else f"out{suffix}")
+        seen.append(tetopt.load_mesh(place) if place.suffix == ".vtu" else place.stat().st_size)
+
+    monkeypatch.setattr(Run, "mend", lambda *a: looked() or mend(*a))
+    monkeypatch.setattr(Source, "fields", lambda *a: looked() or fields(*a))
+    job = tetopt.Job(
+        images=tmp_path / "a.nii",
+        labels=tmp_path / "l.nii",
+        output=tmp_path / f"out{suffix}",
+        nodes=300,
+        young="3",
+        nu="0.3",
+    )
+    result = tetopt.run(job, lambda event: None, stop=stop)
+    assert (result.numbers["ended"], len(seen) >= 2) == ("stopped", True)
+    if suffix != ".inp":
+        assert set(np.unique(seen[0].cell_data["label"])) == {0, 1}
+        assert len(seen[-1].mesh.cells) == len(result.mesh.cells)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.nii", "l.nii", f"out{suffix}"]

@@ -25,7 +25,9 @@ class _Ending:
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
         self.numbers.append(number)
         if self.is_deferred and len(self.numbers) == 1:
-            log.print("interrupted: finishing the current nodes, then writing the mesh (interrupt again to discard it)")
+            log.print(
+                "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end at once)"
+            )
             return
         if self.is_deferred:
             log.print("interrupted again: unwritten results are discarded")

@@ -87,6 +87,7 @@ def optimize(
     max_seconds: float | None = None,
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
+    keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
 ) -> MeshingResult:
     """Move and reconnect the nodes of a mesh to lower E.
 
@@ -130,6 +131,9 @@ def optimize(
         exchanged. Without a callback, a notebook shows a progress bar.
     stop : callable, optional
         Called between colours of nodes; True ends the run.
+    keep : callable, optional
+        Called with the mesh and the labels of its cells, if they have any, as soon as the run is cut short: lifting
+        cells and checking the mesh take more time.
 
     Returns
     -------
@@ -174,7 +178,7 @@ def optimize(
     course = Course(
         1, iterations, iterations, n_early, min_dihedral, tolerance, nodes, sizes, carves=boundary != "fixed"
     )
-    history, ended = followed(run, course, is_over, begin, callback)
+    history, ended = followed(run, course, is_over, begin, callback, keep)
     if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
         run.give_labels()
         run.mend_surfaces(False, min_dihedral)
@@ -204,6 +208,7 @@ def followed(
     is_over: Callable[[], bool],
     begin: float,
     callback: Callable[[IterationRecord], None] | None,
+    keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
 ) -> tuple[list[IterationRecord], str]:
     """Do the iterations of a course; return the records and "iterations", "converged" or "over"."""
     history: list[IterationRecord] = []
@@ -238,10 +243,13 @@ def followed(
         is_new = is_labelled or (has_labels and not run.has_labels)  # E is defined differently: nothing has settled yet
         fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         # 3. Exchange nodes: in every second of the first iterations.
-        if nodes is not None and does_exchange:
+        if nodes is not None and does_exchange and not is_over():
             n_changes += run.exchange_towards(nodes, course.sizes)
         # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts do so in
         # every round, as nodes of flat cells may be fixed in the next one.
+        is_finished = is_finished and (iteration == course.last or not is_over())
+        if not is_finished and keep is not None:
+            keep(run.mesh(), run.labels())
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
         n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,18 +31,19 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
 from tetopt.job.in_parts import run_in_parts
-from tetopt.job.model import check_early
+from tetopt.job.model import check_early, keep_early
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
 from tetopt.job.predict import stated_prediction
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
+from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
-from tetopt.system.files import check_space
+from tetopt.system.files import check_space, kept_places
 
 CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
 LONG_SECONDS = 3.0  # above it, the kernels were compiled, not loaded
@@ -61,6 +65,14 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
+    early: list[Path] = []
+
+    def keep(mesh: Mesh, labels: NDArray[np.int64] | None) -> None:
+        if labels is None and task.source.labels is not None:
+            labels = cell_labels(task.source.labels, mesh)
+        beside = islice(kept_places(job.output, ".vtu"), 1)
+        place = keep_early(mesh, labels, early[-1:] or (job.output, *beside))
+        early.extend([] if place is None else [place])
 
     def watch(initial: Mesh, run: Run) -> MeshingResult:
         if not begun:
@@ -73,7 +85,8 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
             content, options["k_D"], "paper" if task.plan.mode == "paper" else "fast", task.plan.mode == "graded", say
         ))  # fmt: skip
         started("optimise", "optimising", options["iterations"])
-        result = watched(run, initial, options["iterations"], ends, stop, limit)
+        kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
+        result = watched(kept, initial, options["iterations"], ends, stop, limit)
         _say_search(task, len(begun), result)
         if job.target_error is not None or job.order == 2:  # a next run may follow
             started("start", START_WORDS)
@@ -94,7 +107,7 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))
     predicted = {"prediction": stated_prediction(task.size), "memory": {"predicted_bytes": n_bytes}}
-    return Meshed(result, result.initial, seconds, predicted)
+    return Meshed(result, result.initial, seconds, predicted, early=early[-1] if early else None)
 
 
 def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:

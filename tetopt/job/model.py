@@ -51,7 +51,7 @@ from tetopt.model.sets import (
     parse_set,
     standard_names,
 )
-from tetopt.system.files import kept_places
+from tetopt.system.files import TakenError, kept_places
 
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
@@ -314,16 +314,20 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     save_model(output, model, space=solver.space, units=solver.units)
 
 
-def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Path | None:
-    """Keep an optimised mesh next to its file until that is written, in case the process ends; return the path."""
-    early = next(kept_places(output, ".vtu"))
-    try:
-        data = {} if labels is None else {"label": labels}
-        save_mesh(early, mesh, data, order=1 if mesh.midpoints is None else 2)
-    except (OSError, MemoryError) as error:
-        note(f"cannot save a copy of the optimised mesh before its file is written: {error_words(error)}")
-        return None
-    return early
+def keep_early(mesh: Mesh, labels: NDArray[np.int64] | None, places: Iterable[Path]) -> Path | None:
+    """Keep an optimised mesh in the first possible place until all is written, in case the process ends; return it."""
+    data, reason = {} if labels is None else {"label": labels}, ""
+    for place in places:
+        try:
+            save_mesh(place, mesh, data, order=1 if mesh.midpoints is None else 2)
+        except TakenError:  # its message says where the mesh is
+            raise
+        except (OSError, MemoryError, InputError) as error:  # as of a format that needs materials
+            reason = error_words(error)
+        else:
+            return place
+    note(f"cannot save a copy of the optimised mesh before its file is written: {reason}")
+    return None
 
 
 def drop_early(early: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -79,6 +80,8 @@ class Meshed(NamedTuple):
         Fields of the cells, if they came with the mesh.
     is_kept : bool
         True if a work directory keeps the mesh until the run is complete.
+    early : Path, optional
+        The file that has the mesh already, without measurements, if the run was cut short.
 
     Examples
     --------
@@ -94,3 +97,4 @@ class Meshed(NamedTuple):
     predicted: dict[str, dict[str, Any]]
     fields: dict[str, NDArray] | None = None
     is_kept: bool = False
+    early: Path | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ from tetopt.report.summary import fidelity, image_summary, measured_each, run_su
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes
-from tetopt.system.files import TakenError
+from tetopt.system.files import TakenError, kept_places
 
 
 def model_with(
@@ -68,15 +69,16 @@ def model_with(
 def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
     """Write the mesh, or save it elsewhere; return the model, and the files' statements about the run.
 
-    Until its file exists, a copy of the mesh is kept next to it, as cell fields are measured first. Measurements that
-    fail are left out, and noted in `failed`.
+    Until its file is whole, a copy of the mesh is kept next to it, as cell fields are measured first, or in the file
+    itself if the run was cut short. Measurements that fail are left out, and noted in `failed`.
     """
     plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
     options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
-    early = None if came.is_kept else keep_early(job.output, result.mesh, result.labels)
+    places = islice(kept_places(job.output, ".vtu"), 1) if came.early is None else [came.early]
+    early = None if came.is_kept else keep_early(result.mesh, result.labels, places)
     if fields is None:
         fields = _measured_fields(source, result, failed)
     try:
@@ -95,7 +97,7 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
         save_anyway(job.output, result.mesh, bare, error, kept)
         raise
     finally:
-        if early is not None:
+        if early is not None and early != job.output:
             drop_early(early)
     return model, about
 

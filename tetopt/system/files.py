@@ -226,7 +226,8 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[tuple[Path, bool
         yield place, outputs is None or outputs.may_replace.get(key, True)
     if outputs is not None and key in outputs.places:
         outputs.may_replace[key] = True
-        outputs.written.append(path)
+        if path not in outputs.written:  # a mesh is written first, and again with its measurements
+            outputs.written.append(path)
 
 
 def _hidden(path: Path) -> str:
