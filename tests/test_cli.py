@@ -595,6 +595,23 @@ def test_threads_that_cannot_be_are_refused(inputs, tmp_path, monkeypatch, capfd
     assert_refused(capfd, command, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("NUMBA_THREADING_LAYER", "foo", "NUMBA_THREADING_LAYER: expected .*workqueue.*, got foo"),
+        ("NUMBA_THREADING_LAYER_PRIORITY", "foo", "NUMBA_THREADING_LAYER_PRIORITY: expected omp tbb workqueue"),
+        ("NUMBA_OPT", "foo", "environment: .*'NUMBA_OPT'.*'foo' could not be parsed; check NUMBA_OPT"),
+        ("MPLBACKEND", "foo", "environment: .*'foo' is not a valid value for backend; check MPLBACKEND"),
+    ],
+)
+def test_a_variable_of_a_library_with_a_bad_value_is_one_line(tmp_path, name, value, words):
+    """In a process of its own, as numba and matplotlib read them once."""
+    command = [sys.executable, "-m", "tetopt", "quality", str(tmp_path / "a.vtu")]
+    ended = subprocess.run(command, env=os.environ | {name: value}, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert re.fullmatch(f"tetopt: {words}.*\n", ended.stderr), ended.stderr
+
+
 def test_the_list_of_commands_has_their_first_lines():
     for name in COMMANDS:
         assert loaded_command(name).__doc__.splitlines()[0] == help_line(name)

@@ -46,6 +46,8 @@ COMMANDS = {
 
 
 COLLECTED_AT = 50_000, 20, 20  # new objects, and collections of a generation; Python's own are 700, 10, 10
+LAYER_POOLS = {"omp": "omppool", "tbb": "tbbpool", "workqueue": "workqueue"}  # numba's threading layers, and modules
+LAYER_KINDS = ("default", "safe", "threadsafe", "forksafe")
 MOST_DIGITS = 4  # of a number of threads: no machine has more
 
 # Options by the names that messages of the library begin with, where these differ by more than a hyphen.
@@ -177,18 +179,49 @@ def loaded_command(name: str) -> Callable[..., Any]:
     Raises
     ------
     InputError
-        There is no room for the libraries that it loads, or the environment's number of threads is invalid.
+        There is no room for the libraries that it loads, or an environment variable of theirs has an invalid value.
     """
     check_addresses()
+    _check_environment()
+    from tetopt.cli.options import from_records  # this import loads the modules of its defaults
+
+    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command"))
+
+
+def _check_environment() -> None:
+    """Raise InputError for an environment variable with which numba or matplotlib would fail in the middle of a run."""
     threads = os.environ.get(THREADS_NAME, "").strip()
     if threads and not (threads.isdecimal() and len(threads) <= MOST_DIGITS and int(threads) >= 1):
         raise InputError(
             f"{THREADS_NAME}: expected a whole number of threads from 1 to {10**MOST_DIGITS - 1}, got "
             f"{threads[:20]}; set a valid number, or unset it"
         )
-    from tetopt.cli.options import from_records  # this import loads the modules of its defaults
+    names = [name for name in os.environ if name.startswith("NUMBA_") and name not in ("NUMBA_CACHE_DIR", THREADS_NAME)]
+    names += ["MPLBACKEND"] if os.environ.get("MPLBACKEND") else []
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # numba's for a value that is no number
+            config = import_module("numba").config if names != ["MPLBACKEND"] and names else None
+            import_module("matplotlib") if "MPLBACKEND" in names else None
+    except Exception as error:
+        words = str(error).partition("; supported values")[0].splitlines()[0].rstrip(".")
+        raise InputError(f"environment: {words}; check {', '.join(names)}") from error
+    if config is None:
+        return
+    able = [name for name, pool in LAYER_POOLS.items() if _is_importable(f"numba.np.ufunc.{pool}")]
+    if config.THREADING_LAYER not in (*able, *LAYER_KINDS):
+        expected = ", ".join((*able, *LAYER_KINDS))
+        raise InputError(f"NUMBA_THREADING_LAYER: expected {expected}, got {config.THREADING_LAYER[:20]}; or unset it")
+    if sorted(config.THREADING_LAYER_PRIORITY) != sorted(LAYER_POOLS):
+        raise InputError(f"NUMBA_THREADING_LAYER_PRIORITY: expected {' '.join(LAYER_POOLS)} in any order, or none")
 
-    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command"))
+
+def _is_importable(name: str) -> bool:
+    try:
+        import_module(name)
+    except ImportError:  # as tbbpool without TBB
+        return False
+    return True
 
 
 def _version(is_requested: bool) -> None:
