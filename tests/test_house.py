@@ -19,7 +19,7 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT 
 WIDE = {
     "tetopt.contents.content.content": 9,
     "tetopt.fem.elasticity.compression": 9,
-    "tetopt.engine.fast.optimize": 13,
+    "tetopt.engine.fast.optimize": 14,
     "tetopt.engine.meshing.mesh_image": 13,
     "tetopt.engine.paper.optimize_paper": 12,
     "tetopt.model.build.build_model": 15,

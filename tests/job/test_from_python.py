@@ -1,5 +1,8 @@
 """What commands do with files, called from Python: the same numbers, files and refusals, and nothing printed."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
@@ -74,3 +77,23 @@ def test_a_violated_requirement_is_told(place):
         wrong = judge(place / "overlapping.vtu", check=True).tell()
     assert wrong == [event.text for event in events if event.kind == "violated"]
     assert wrong[0].startswith(str(place / "overlapping.vtu"))
+
+
+@pytest.mark.full
+def test_a_pool_of_new_processes_works_after_a_run(tmp_path):
+    """As the page on processes says; one that forks waits for ever."""
+    (tmp_path / "program.py").write_text(
+        "import multiprocessing\n"
+        "import numpy as np\n"
+        "import tetopt\n\n\n"
+        "def voxels(size):\n"
+        "    image = tetopt.Image(np.ones((size,) * 3))\n"
+        "    return int(tetopt.cell_moments(image, tetopt.lattice_mesh(image, nodes=60)).n_voxels.sum())\n\n\n"
+        "if __name__ == '__main__':\n"
+        "    print(voxels(4))\n"
+        "    with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
+        "        print(pool.map(voxels, [4, 5]))\n"
+    )
+    command = [sys.executable, str(tmp_path / "program.py")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.split("\n")[:2] == ["64", "[64, 125]"]

@@ -100,7 +100,10 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     Notes
     -----
     In parts, workers are processes that first import your program: call this function under
-    ``if __name__ == "__main__":``.
+    ``if __name__ == "__main__":``. For processes of your own, use ``multiprocessing.get_context("spawn")``: a pool
+    that forks after a run never ends, as OpenMP's threads do not survive a fork.
+
+    Ctrl-C raises KeyboardInterrupt, and an unwritten mesh is lost; to keep the current mesh, return True from `stop`.
 
     Examples
     --------
