@@ -386,7 +386,9 @@ def _world_corners(grid: Any) -> NDArray[np.float64]:
 
 def _extent(grid: Any) -> str:
     world = _world_corners(grid)
-    return " x ".join(f"{a:.1f}..{b:.1f}" for a, b in zip(world.min(axis=0), world.max(axis=0), strict=True))
+    low, high = world.min(axis=0), world.max(axis=0)
+    decimals = max(1, 1 - int(np.floor(np.log10((high - low).min()))))  # more in micro-CT
+    return " x ".join(f"{a:.{decimals}f}..{b:.{decimals}f}" for a, b in zip(low, high, strict=True))
 
 
 def _on_faces(data: NDArray) -> NDArray:

@@ -16,7 +16,8 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room
 from tetopt.system.incoming import irregular
 
-HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # files whose headers are read here
+NRRD_SUFFIXES = (".nrrd", ".nhdr")
+HEADED_SUFFIXES = (*NRRD_SUFFIXES, ".mha", ".mhd")  # files whose headers are read here
 HEADER_BYTES = 2**20  # at most in a header: 3D Slicer's long ones have 10,000
 MOST_AXES = 8  # more than space, time and components
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
@@ -95,7 +96,7 @@ def read_header(path: Path) -> VoxelHeader:
     """Return the header of a file; InputError for the reasons of `checked_header` in the header."""
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
-    header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    header = _nrrd(head) if path.suffix.lower() in NRRD_SUFFIXES else _metaimage(head)
     if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
         raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data files)")
     return header

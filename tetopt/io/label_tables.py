@@ -2,6 +2,7 @@
 
 - FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue, opacity, 0 to 255.
 - ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation marks.
+- 3D Slicer's segmentations (.seg.nrrd): the names and colours of their segments.
 - BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row, separated by tabs, commas
   or semicolons: columns for the label, the name, and optionally the colour, as "#rrggbb" or as three numbers.
 
@@ -18,8 +19,11 @@ from typing import NamedTuple
 
 from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
+from tetopt.io.itk_headers import NRRD_SUFFIXES, read_header
+from tetopt.io.segments import segments_of, segments_table
+from tetopt.io.volumes import one_line
 from tetopt.model.labels import NO_TABLE, LabelTable
-from tetopt.system.incoming import text_of
+from tetopt.system.incoming import irregular, text_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
@@ -46,12 +50,13 @@ def load_label_table(path: str | Path) -> LabelTable:
     """Load names and colours of labels from a file.
 
     Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv` and any CSV with
-    column names in the first row are recognised by their content; `tetopt.io.label_tables` lists the columns.
+    column names in the first row are recognised by their content; `tetopt.io.label_tables` lists the columns. So are
+    segmentations with names of their own: 3D Slicer's (.seg.nrrd).
 
     Parameters
     ----------
     path : str or Path
-        A text file.
+        A text file, or a segmentation.
 
     Returns
     -------
@@ -73,6 +78,10 @@ def load_label_table(path: str | Path) -> LabelTable:
     {1: 'liver', 2: 'spleen'}
     """
     path = Path(path)
+    if (table := own_label_table(path)).names:
+        return table
+    if path.name.lower().endswith(NRRD_SUFFIXES):
+        raise InputError(f"{path}: expected names of segments in this file, found none")
     text = text_of(path, "table of labels' names")
     lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
     lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
@@ -94,6 +103,22 @@ def load_label_table(path: str | Path) -> LabelTable:
     if not table.names:
         raise InputError(f"{path}: expected names of labels, found none")
     return table
+
+
+def own_label_table(path: Path) -> LabelTable:
+    """Return the names and colours that a segmentation's own file has; empty for a file without any.
+
+    Raises
+    ------
+    InputError
+        The file is such a segmentation and cannot be read.
+    """
+    if not path.name.lower().endswith(NRRD_SUFFIXES) or irregular(path) is not None:
+        return NO_TABLE
+    try:
+        return segments_table(segments_of(read_header(path).texts))
+    except InputError as error:
+        raise InputError(f"{path}: {one_line(error)}") from error
 
 
 def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:

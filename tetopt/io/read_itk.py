@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import notes_of_metaimage, notes_of_nrrd, notes_of_rest
-from tetopt.io.itk_headers import checked_header
+from tetopt.io.itk_headers import NRRD_SUFFIXES, checked_header
+from tetopt.io.segments import labels_of_layers, segments_of
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
 from tetopt.system.extras import install_hint
@@ -33,13 +34,18 @@ def read_itk(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray,
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
     header, size = checked_header(path)
-    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
+    is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
     about = notes_of_nrrd(dict(header.stated), header.sizes) if is_nrrd else notes_of_metaimage(header.stated)
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
         about += notes_of_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     lengths = (_nrrd_units if is_nrrd else _metaimage_units)(dict(header.stated), about)
-    data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=header.value_bytes, library="SimpleITK")
+    segments = segments_of(header.texts)
+    data, affine = read_apart(
+        _volume_of, path, volume, bool(segments), size=size, value_bytes=header.value_bytes, library="SimpleITK"
+    )
+    if segments:
+        data = labels_of_layers(data, segments, about)
     n = len(affine) - 1
     affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
     notes += about + notes_of_size(data.shape, affine, lengths)
@@ -73,7 +79,8 @@ def _check_installed() -> None:
 # In the child
 
 
-def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data, with layers on a last axis if it has them, and affine."""
     import SimpleITK as sitk
 
     try:
@@ -81,13 +88,18 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
         reader.SetFileName(path)
         reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
         reader.ReadImageInformation()
-        _check_components(reader.GetNumberOfComponents())
+        n_layers = reader.GetNumberOfComponents() if has_layers else 0
+        if not has_layers:
+            _check_components(reader.GetNumberOfComponents())
         size = reader.GetSize()
         index = volume_index(size[3:], volume)
         if index:
             reader.SetExtractSize([*size[:3], *(0 for _ in index)])
             reader.SetExtractIndex([0, 0, 0, *index])
-        return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
+        data = sitk.GetArrayFromImage(reader.Execute())
+        if has_layers:  # components vary fastest
+            return np.moveaxis(data.reshape(*size[::-1], n_layers).T, 0, -1), _ras_affine(reader)
+        return data.T, _ras_affine(reader)
     except RuntimeError as error:
         raise _in_words(error) from error
 

@@ -29,13 +29,13 @@ from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice, part_of, sha256
-from tetopt.io.label_tables import LabelTable, load_label_table
+from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, own_mask
-from tetopt.model.labels import NO_TABLE, labels_of
+from tetopt.model.labels import NO_TABLE, TABLE_TEXT, labels_of, table_words
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.files import checked_output
@@ -257,20 +257,29 @@ def with_labels(loaded: MeshFile, path: Path | None, options: MaskPart) -> MeshF
 
     try:
         counted = continued(labels, mask_for(options, labels, beside, loaded))
-        return loaded._replace(cell_data={**loaded.cell_data, "label": cell_labels(counted, loaded.mesh)})
+        fields = {**loaded.cell_data, "label": cell_labels(counted, loaded.mesh)}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    own = table_of_segmentation(path)
+    texts = {TABLE_TEXT: np.array([table_words(own)])} if own.names else {}
+    return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts})
 
 
-def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable:
-    """Return names and colours of labels: those of the file, else those in the mesh's file, else none."""
+def table_of_segmentation(path: Path | None) -> LabelTable:
+    """Return the names and colours that the file of labels itself has, empty if it has none."""
+    return NO_TABLE if path is None else own_label_table(file_and_volume(path)[0])
+
+
+def label_table(path: Path | None, loaded: MeshFile | None = None, labels_path: Path | None = None) -> LabelTable:
+    """Return names and colours of labels: those of the file, else in the mesh's file, else in that of the labels."""
     if path is not None:
         table = load_label_table(path)
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
             warning(f"{path}: contains none of the mesh's labels, {listed(np.unique(labels).tolist())}")
         return table
-    return NO_TABLE if loaded is None else loaded.label_table
+    table = NO_TABLE if loaded is None else loaded.label_table
+    return table if table.names else table_of_segmentation(labels_path)
 
 
 def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:

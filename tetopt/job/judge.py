@@ -124,7 +124,7 @@ def judge(
         has_mask = mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
-        measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
+        measured |= _names(measured.get("labels", []), label_table(label_names, loaded, labels).names)
         numbers |= {**measured, "image": image.name, "fit": fit}
         judgement = judgement._replace(fit=fit, result=result, measured=measured)
     if check:

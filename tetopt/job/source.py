@@ -199,7 +199,7 @@ def _labelling(
     numbers: Mapping[int, int] | None,
 ) -> ReadLabels:  # fmt: skip
     """Read the labels, merged by the options, or the tissues."""
-    table, is_alone = label_table(label_names), len(options.images) == 1
+    table, is_alone = label_table(label_names, labels_path=options.labels), len(options.images) == 1
     if options.tissues is not None:
         volumes = tissue_volumes(options.tissues)
         tissues = [beside(path, resample_tissue) for path in volumes.values()]

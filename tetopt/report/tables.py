@@ -37,6 +37,20 @@ def size_words(ndim: int) -> str:
     return "volume, mm3" if ndim == 3 else "area, mm2"
 
 
+def size_text(number: float, decimals: int) -> str:
+    """Format a length, area or volume with these decimals, or more for three significant digits; "-" if not finite.
+
+    Examples
+    --------
+    >>> size_text(1234.56, 1), size_text(0.0579, 1), size_text(0.0, 1), size_text(2.5e-7, 2)
+    ('1234.6', '0.0579', '0.0', '2.5e-07')
+    """
+    if not np.isfinite(number):
+        return "-"
+    digits = f"{number:.{decimals}f}"
+    return f"{number:.3g}" if 0.0 < abs(number) < 10.0 ** (2 - decimals) else digits
+
+
 def nodes_in_words(mesh: Mesh, order: int) -> str:
     """Describe the number of nodes of a mesh: "4864 nodes", or for order 2 "716 corner nodes, 5012 in all"."""
     if order == 1:
@@ -53,7 +67,7 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jaco
         table.add_row("nodes in all", *map(str, in_all))
     rows: list[tuple[str, Callable[[Quality], str]]] = [
         ("cells", lambda q: str(q.n_cells)),
-        (size_words(meshes[0].ndim), lambda q: f"{q.volume:.2f}"),
+        (size_words(meshes[0].ndim), lambda q: size_text(q.volume, 2)),
         ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
         ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
         ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
@@ -78,7 +92,7 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
     """Return a table of how well a mesh fills its mask, which the table calls `word`."""
     table = new_table(word, "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
-    table.add_row(size_words(ndim), f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
+    table.add_row(size_words(ndim), size_text(mask.volume, 1), f"{size_text(mask.mesh_volume, 1)} ({change:+.1f} %)")
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
     for title, *distances in (
         (f"boundary to the {word}'s surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
@@ -86,7 +100,8 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
         (f"the {word}'s surface to the boundary, mean, 95 %", mask.reverse_mean, mask.reverse_p95, mask.reverse_mean_mm,
          mask.reverse_p95_mm),
     ):  # fmt: skip
-        mean, p95, mean_mm, p95_mm = (f"{distance:.3f}" for distance in distances)
+        mean, p95 = (f"{voxels:.3f}" for voxels in distances[:2])
+        mean_mm, p95_mm = (size_text(mm, 3) for mm in distances[2:])
         is_there = not np.isnan(distances).any()  # both surfaces exist off the faces of the box
         shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one surface is missing", "")
         table.add_row(title, *shown)
@@ -127,8 +142,8 @@ def label_table(
     for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
         words = _label_words(row.label, names)
-        size = _decimals(row.volume, 1 if row.volume < LARGE_SIZE else 0)
-        apart = [_decimals(mm, 3) for mm in (row.distance_mean, row.distance_p95, row.distance_max)]
+        size = size_text(row.volume, 1 if row.volume < LARGE_SIZE else 0)
+        apart = [size_text(mm, 3) for mm in (row.distance_mean, row.distance_p95, row.distance_max)]
         table.add_row(
             words, str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
             f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, _decimals(surface.area_ratio, 3),
@@ -171,7 +186,7 @@ def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], nd
     for each in sorted(more, key=lambda each: each.voxels_mm2 - each.mesh_mm2)[:WORST_ROWS]:
         words = ", ".join(_label_words(label, names) for label in each.labels)
         ratio = _decimals(each.ratio, 2) if each.voxels_mm2 else "false"
-        table.add_row(words, f"{each.mesh_mm2:.1f}", f"{each.voxels_mm2:.1f}", ratio)
+        table.add_row(words, size_text(each.mesh_mm2, 1), size_text(each.voxels_mm2, 1), ratio)
     return table
 
 
@@ -179,13 +194,13 @@ def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
     """Describe the excess contact between labels."""
     unit = "mm2" if ndim == 3 else "mm"
     return (
-        f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: {totals['excess_mm2']:.1f} {unit}, including "
-        f"{totals['false_mm2']:.1f} {unit} between labels that do not touch in the voxels"
+        f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: {size_text(totals['excess_mm2'], 1)} {unit}, "
+        f"including {size_text(totals['false_mm2'], 1)} {unit} between labels that do not touch in the voxels"
     )
 
 
 def _percentile_texts(thickness: Thickness | None) -> list[str]:
-    return ["-"] * 3 if thickness is None else [f"{mm:.2f}" for mm in thickness]
+    return ["-"] * 3 if thickness is None else [size_text(mm, 2) for mm in thickness]
 
 
 def _label_words(label: int, names: Mapping[int, str]) -> str:

@@ -1,0 +1,134 @@
+"""Segmentations of 3D Slicer: layers, names, numbers and overlaps."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.io.images import load_image
+from tetopt.io.label_tables import load_label_table
+
+sitk = pytest.importorskip("SimpleITK")
+pytestmark = pytest.mark.usefixtures("here")
+
+HEAD = (
+    "NRRD0004\ntype: uint8\ndimension: 4\nspace: left-posterior-superior\nsizes: {sizes}\nspace directions: none "
+    "(1,0,0) (0,2,0) (0,0,3)\nkinds: list domain domain domain\nencoding: raw\nspace origin: (5,6,7)\n"
+)
+LAYERS = np.zeros((2, 6, 5, 4), np.uint8)
+LAYERS[0, 1:5, 1:4, 1:3] = 1  # liver, 24 voxels
+LAYERS[0, 0, 0, 0] = 2  # bone
+LAYERS[1, 3:6, 1:4, 1:3] = 1  # tumour, 18 voxels, 12 of them in the liver
+SEGMENTS = [("liver", 1, 0), ("bone", 2, 0), ("tumour", 1, 1)]
+
+
+def seg_nrrd(folder, layers=LAYERS, segments=SEGMENTS, more="", name="a.seg.nrrd"):
+    """A file of layers (L, x, y, z) and segments (name, value, layer)."""
+    text = HEAD.format(sizes=" ".join(map(str, layers.shape))) + more
+    for k, (segment, value, layer) in enumerate(segments):
+        text += f"Segment{k}_Name:={segment}\nSegment{k}_ID:=Segment_{k}\n"
+        text += "" if value is None else f"Segment{k}_LabelValue:={value}\nSegment{k}_Layer:={layer}\n"
+    (folder / name).write_bytes(text.encode() + b"\n" + layers.tobytes(order="F"))
+    return folder / name
+
+
+def read(path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        image = load_image(path)
+    return image, [str(each.message).removeprefix(f"{path}: ") for each in caught if each.category is UserWarning]
+
+
+def test_layers_that_share_values(tmp_path):
+    """The numbers are the segments' order; the later layer wins; both are told."""
+    path = seg_nrrd(tmp_path, more="Segment2_Color:=1 0.5 0\n")
+    image, said = read(path)
+    expected = LAYERS[0].copy()
+    expected[LAYERS[1] == 1] = 3
+    np.testing.assert_array_equal(image.data, expected)
+    np.testing.assert_array_equal(
+        image.affine, np.array([[-1, 0, 0, -5], [0, -2, 0, -6], [0, 0, 3, 7], [0, 0, 0, 1.0]])
+    )
+    assert said == [
+        "its segments share label values; they are numbered in order: 1 liver, 2 bone, 3 tumour",
+        'segment "tumour" covers 12 of the 24 voxels of "liver"; later layers win',
+    ]
+    assert load_label_table(path) == ({1: "liver", 2: "bone", 3: "tumour"}, {3: (1.0, 0.5, 0.0)})
+
+
+def test_values_of_the_file_are_kept(tmp_path):
+    """In one layer, and where each segment has a value of its own."""
+    layer = LAYERS[:1].copy()
+    layer[layer == 2] = 77
+    path = seg_nrrd(tmp_path, layer, [("liver", 1, 0), ("bone", 77, 0)])
+    image, said = read(path)
+    np.testing.assert_array_equal(image.data, layer[0])
+    assert (said, load_label_table(path).names) == ([], {1: "liver", 77: "bone"})
+    layers = LAYERS * np.array([1, 9], np.uint8)[:, None, None, None]
+    image, said = read(seg_nrrd(tmp_path, layers, [("liver", 1, 0), ("bone", 2, 0), ("tumour", 9, 1)]))
+    assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 24 - 1 - 6, 12, 1, 18]
+    assert [np.unique(image.data).tolist(), len(said)] == [[0, 1, 2, 9], 1]
+
+
+def test_files_of_older_programs(tmp_path):
+    """Each segment is a layer of ones, in order."""
+    image, said = read(seg_nrrd(tmp_path, LAYERS & 1, [("liver", None, None), ("tumour", None, None)]))
+    assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 30, 12, 18]
+    assert "1 liver, 2 tumour" in said[0]
+
+
+def test_what_cannot_be_told_apart(tmp_path):
+    image, said = read(seg_nrrd(tmp_path, LAYERS[:1], [("liver", 1, 0), ("lobe", 1, 0)]))
+    assert said == [
+        'segments of one layer share a label value and cannot be told apart: "liver / lobe"',
+        "1 voxels have values of no segment ([2]) and get label 0",
+    ]
+    assert image.data[0, 0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("segment", "match"),
+    [
+        (("liver", 1, 2), 'segment "liver" is in layer 2, but the file has 2'),
+        (("liver", 0, 0), "from 1 as its LabelValue"),
+        (("liver", "x", 0), 'its LabelValue, got "x"'),
+        (("liver", 10**10, 0), "its LabelValue"),
+    ],
+)
+def test_segments_that_are_not_there(tmp_path, segment, match):
+    with pytest.raises(InputError, match=match):
+        load_image(seg_nrrd(tmp_path, segments=[segment]))
+
+
+def test_an_nrrd_without_segments(tmp_path):
+    path = seg_nrrd(tmp_path, segments=[])
+    with pytest.raises(InputError, match="expected one number per voxel, got 2"):
+        load_image(path)
+    with pytest.raises(InputError, match="expected names of segments in this file, found none"):
+        load_label_table(path)
+
+
+def test_names_come_with_the_labels(tmp_path):
+    """Without --label-names, a run takes the names of the segmentation itself; a table replaces them."""
+    path = seg_nrrd(tmp_path)
+    (tmp_path / "t.csv").write_text("label,name\n1,a\n2,b\n3,c\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu")
+        assert tetopt.read(job).source.table.names == {1: "liver", 2: "bone", 3: "tumour"}
+        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=tmp_path / "t.csv")
+        assert tetopt.read(job).source.table.names == {1: "a", 2: "b", 3: "c"}
+        named = seg_nrrd(tmp_path, segments=[("A", 1, 0), ("B", 2, 0), ("C", 1, 1)], name="b.seg.nrrd")
+        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=named)
+        assert tetopt.read(job).source.table.names == {1: "A", 2: "B", 3: "C"}
+
+
+@pytest.mark.full
+def test_real_overlapping_segments(data_dir):
+    image, said = read(data_dir / "SegmentationOverlapping.seg.nrrd")
+    raw = sitk.GetArrayFromImage(sitk.ReadImage(str(data_dir / "SegmentationOverlapping.seg.nrrd"))).T
+    np.testing.assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
+    assert 'segment "overlapping sphere" covers 491 of the 8487 voxels of "ribs", 118' in said[1]
+    assert load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8] == "overlapping sphere"
