@@ -395,6 +395,13 @@ def test_compressed_voxels(tmp_path):
     assert_refused(path, "truncated or damaged")
 
 
+def test_more_voxels_than_the_header_declares(tmp_path):
+    data = one_slice(RAMP[0], ORIGIN, SliceThickness=3)
+    data.PixelData = RAMP.tobytes()
+    with pytest.warns(UserWarning, match="more bytes of voxels than its header declares"):
+        np.testing.assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, :, 0], RAMP[0].T)
+
+
 # --------------------------------------------------------------------------------------------------
 # Segmentations
 

@@ -137,7 +137,7 @@ def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64
     if is_segmentation and len(files) > 1:
         raise InputError(f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}")
     for file in files:
-        _check_voxels(file)
+        _check_voxels(file, notes)
     _check_sizes(files)
     frames = _one_volume([frame for file in files for frame in _frames(file, notes)], volume)
     grid = _placed(frames, notes, is_sparse=is_segmentation)
@@ -265,7 +265,7 @@ def _no_voxels(file: DicomFile) -> str:
     return f"is of the kind {kind}, without voxels; give the images themselves"
 
 
-def _check_voxels(file: DicomFile) -> None:
+def _check_voxels(file: DicomFile, notes: list[str]) -> None:
     """Raise InputError unless the voxels are numbers that can be decoded here."""
     from pydicom.pixels import get_decoder
 
@@ -297,6 +297,11 @@ def _check_voxels(file: DicomFile) -> None:
                 f"{file.name} is truncated or damaged: its header declares {file.n_frames} x {rows} x {columns} "
                 f"voxels, at least {least:.4g} bytes, but it has {n_bytes}; copy it again"
             )
+        words = (
+            "more bytes of voxels than its header declares: the rest is ignored; check Rows, Columns, NumberOfFrames"
+        )
+        if not syntax.is_compressed and n_bytes > least + 2 and words not in notes:  # one or two may be padding
+            notes.append(words)
 
 
 def _check_sizes(files: list[DicomFile]) -> None:
@@ -583,8 +588,14 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
 
     file, indices = frames[0].file, [frame.number for frame in frames]
     is_all = indices == list(range(file.n_frames))  # read in one go
+    options: dict[str, Any] = {"raw": True, "allow_excess_frames": False}
+    count = 0
     with _errors_of(file.name):
-        yield from iter_pixels(file.tags, raw=True, indices=None if is_all else indices)
+        for plane in iter_pixels(file.tags, indices=None if is_all else indices, **options):
+            yield plane
+            count += 1
+    if count < len(frames):
+        raise InputError(f"{file.name} is truncated or damaged: {count} of its frames are complete; copy it again")
 
 
 def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
