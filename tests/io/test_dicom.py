@@ -7,10 +7,13 @@ import warnings
 
 import numpy as np
 import pytest
+from commands import exit_code
 
+import tetopt
 from tetopt.errors import InputError
 from tetopt.io import read_dicom
 from tetopt.io.images import load_image
+from tetopt.io.label_tables import load_label_table
 
 pydicom = pytest.importorskip("pydicom")
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset  # noqa: E402
@@ -521,3 +524,38 @@ def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
 
     with pytest.warns(UserWarning, match="1.5 mm apart as it states, but its frames 3 mm"):
         assert load_image(edited(hd, tmp_path / "a.dcm", half)).shape == (7, 8, 13)
+
+
+def test_names_and_colours_of_segments(tmp_path, hd):
+    """As `--label-names` reads them; from the folder, too. Names that two segments share get numbers."""
+    path = segmentation(hd, tmp_path / "a.dcm", blobs())
+    for source in (path, tmp_path):
+        table = load_label_table(source)
+        assert table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
+        np.testing.assert_allclose(list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004)
+    with pytest.raises(InputError, match="expected names of segments in this file, found none"):
+        load_label_table(saved(tmp_path / "b.dcm", enhanced(RAMP, places())))
+
+
+@pytest.mark.full
+def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd):
+    """Frames in another order, and a segmentation with fewer slices: labels lie where they were, with their names."""
+    k, j, i = np.indices((16, 30, 20))
+    world = ORIGIN + i[..., None] * BETWEEN_COLUMNS * AXES[0] + j[..., None] * BETWEEN_ROWS * AXES[1]
+    world = world + k[..., None] * STEP * NORMAL
+    centre = ORIGIN + 7 * AXES[0] + 7 * AXES[1] + 22 * NORMAL
+    far = np.linalg.norm(world - centre, axis=-1)
+    voxels = np.stack([far < 6, (k == 3) & (i < 4) & (j < 9), (k == 13) & (i > 15)], axis=-1)
+    order = np.random.default_rng(0).permutation(16)
+    scan = saved(tmp_path / "ct.dcm", enhanced(1000 * (far < 6)[order], places(16)[order]))
+    labels = segmentation(hd, tmp_path / "seg.dcm", voxels)
+    assert exit_code("mesh", scan, "--labels", labels, "-o", tmp_path / "a.vtu", "--nodes", 900) == 0
+    loaded = tetopt.load_mesh(tmp_path / "a.vtu")
+    assert loaded.label_table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
+    points = loaded.mesh.points[loaded.mesh.cells]
+    volume = np.abs(np.linalg.det(points[:, 1:] - points[:, :1])) / 6
+    is_in = loaded.cell_data["label"] == 1
+    expected = np.count_nonzero(voxels[..., 0]) * BETWEEN_COLUMNS * BETWEEN_ROWS * STEP
+    assert volume[is_in].sum() == pytest.approx(expected, rel=0.03)
+    at = np.average(points[is_in].mean(axis=1), axis=0, weights=volume[is_in])
+    np.testing.assert_allclose(at, centre * [-1, -1, 1], rtol=0, atol=0.2)

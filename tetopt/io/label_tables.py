@@ -2,7 +2,7 @@
 
 - FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue, opacity, 0 to 255.
 - ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation marks.
-- 3D Slicer's segmentations (.seg.nrrd): the names and colours of their segments.
+- 3D Slicer's segmentations (.seg.nrrd) and DICOM's (SEG): the names and colours of their segments.
 - BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row, separated by tabs, commas
   or semicolons: columns for the label, the name, and optionally the colour, as "#rrggbb" or as three numbers.
 
@@ -20,6 +20,7 @@ from typing import NamedTuple
 from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
 from tetopt.io.itk_headers import NRRD_SUFFIXES, read_header
+from tetopt.io.read_dicom import dicom_file, read_segments_table
 from tetopt.io.segments import segments_of, segments_table
 from tetopt.io.volumes import one_line
 from tetopt.model.labels import NO_TABLE, LabelTable
@@ -51,7 +52,7 @@ def load_label_table(path: str | Path) -> LabelTable:
 
     Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv` and any CSV with
     column names in the first row are recognised by their content; `tetopt.io.label_tables` lists the columns. So are
-    segmentations with names of their own: 3D Slicer's (.seg.nrrd).
+    segmentations with names of their own: 3D Slicer's (.seg.nrrd) and DICOM's.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def load_label_table(path: str | Path) -> LabelTable:
     path = Path(path)
     if (table := own_label_table(path)).names:
         return table
-    if path.name.lower().endswith(NRRD_SUFFIXES):
+    if path.name.lower().endswith(NRRD_SUFFIXES) or dicom_file(path) is not None:
         raise InputError(f"{path}: expected names of segments in this file, found none")
     text = text_of(path, "table of labels' names")
     lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
@@ -113,9 +114,11 @@ def own_label_table(path: Path) -> LabelTable:
     InputError
         The file is such a segmentation and cannot be read.
     """
-    if not path.name.lower().endswith(NRRD_SUFFIXES) or irregular(path) is not None:
-        return NO_TABLE
     try:
+        if (file := dicom_file(path)) is not None:
+            return read_segments_table(file)
+        if not path.name.lower().endswith(NRRD_SUFFIXES) or irregular(path) is not None:
+            return NO_TABLE
         return segments_table(segments_of(read_header(path).texts))
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from error

@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
+from tetopt.io.text import plain
 from tetopt.io.units import notes_of_size
 from tetopt.io.volumes import UNREADABLE_FILE, check_room, one_line, volume_index
+from tetopt.model.labels import LabelTable
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -105,9 +107,18 @@ def read_dicom(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArra
     return data, affine
 
 
-def read_segments(path: Path) -> list[tuple[int, str, list[float]]]:
-    """Return number, name and colour (empty if it has none) of the segments; none of other kinds of DICOM."""
-    return [tuple(row) for row in _read(segments_of, path)]
+def read_segments_table(path: Path) -> LabelTable:
+    """Return names and colours of the segments in a file; none for other kinds of DICOM."""
+    rows = _read(segments_of, path)
+    names, colours = ({row[0]: row[part] for row in rows if row[part]} for part in (1, 2))
+    return LabelTable(names, {number: tuple(parts) for number, parts in colours.items()})
+
+
+def dicom_file(path: Path) -> Path | None:
+    """Return the path if it is a DICOM file, or the only one in this folder; otherwise None."""
+    files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path] if path.is_file() else []
+    files = [file for file in files if is_dicom(file)]
+    return files[0] if len(files) == 1 else None
 
 
 def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
@@ -153,7 +164,7 @@ def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
     for file in _series(Path(path), []):
         for segment in file.tags.get("SegmentSequence") or ():
             lab = segment.get("RecommendedDisplayCIELabValue")
-            name = one_line(segment.get("SegmentLabel") or segment.get("SegmentDescription") or "")
+            name = plain(one_line(segment.get("SegmentLabel") or segment.get("SegmentDescription") or ""))
             rows.append((int(segment.SegmentNumber), name, [] if lab is None else _srgb([int(part) for part in lab])))
     count = Counter(name for _, name, _ in rows)
     return [(number, name if count[name] == 1 or not name else f"{name} {number}", tone) for number, name, tone in rows]
@@ -626,7 +637,7 @@ def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int]
     tags = frames[0].file.tags
     order = np.lexsort([np.array([frame.segment for frame in frames]), grid.slices])
     frames, slices = [frames[k] for k in order], grid.slices[order]
-    names = {int(each.SegmentNumber): one_line(each.get("SegmentLabel") or "") for each in tags.SegmentSequence}
+    names = {int(each.SegmentNumber): plain(one_line(each.get("SegmentLabel") or "")) for each in tags.SegmentSequence}
     for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
         if (one.segment, k) == (other.segment, before):
             raise InputError(f"{one.name} and {other.name} have one segment and position; export it again")

@@ -59,8 +59,8 @@ LabelNamesOption = Annotated[
     Path | None,
     Option(
         "TABLE",
-        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer (also .seg.nrrd), BIDS "
-        "dseg.tsv, or CSV (default: those in the file of labels).",
+        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer (also .seg.nrrd), "
+        "DICOM SEG, BIDS dseg.tsv, or CSV (default: those in the file of labels).",
     ),
 ]
 SpaceOption = Annotated[str, Option("ras|lps", "Coordinate convention of the file.")]
