@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# numba does not see edits in imported files: the tests' cache of compiled kernels is keyed by all sources.
+# numba does not see edits in imported files: the tests' cache of compiled kernels is keyed by all sources. `make demo`
+# uses the package's own, which `tetopt` keys by the kernels' sources, so that the commands after it compile nothing.
 NUMBA_CACHE = $(CURDIR)/.numba_cache/$(shell cat tetopt/*.py tetopt/*/*.py | cksum | cut -d' ' -f1)
 # UTF-8, as Python chooses it by itself, but not in the processes that pytest-xdist starts.
 TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
@@ -15,7 +16,7 @@ SOLVERS = calculix-ccx python3-dolfinx
 .PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench measured bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
+	$(BIN)/tetopt demo -o demo --force
 
 # Between edits: units, laws, twins, one whole run of each command.
 check: $(VENV)/.test

@@ -30,6 +30,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
 
 
+@pytest.fixture(autouse=True)
+def wide_lines(monkeypatch):
+    """Sentences on one line, as tests look for parts of them; `test_cli_width.py` has lines as users see them."""
+    monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real volumes: TETOPT_DATA, else ../shared/data beside the repository."""

@@ -319,7 +319,7 @@ MEASURES = {  # where each is called, and its keys in run.json
     "label_fidelity": (tetopt.report.summary, {"labels"}),
     "label_interfaces": (tetopt.report.summary, {"interfaces"}),
     "label_contacts": (tetopt.report.summary, {"contacts"}),
-    "label_thickness": (tetopt.report.summary, {"thickness"}),
+    "label_layers": (tetopt.report.summary, {"thickness"}),
     "by_contrast": (tetopt.job.source.Source, {"contrasts"}),
     "fields": (tetopt.job.source.Source, {"cells_without_voxel"}),
 }
@@ -363,8 +363,9 @@ def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsy
     assert keys <= {key for key, value in numbers.items() if value is None}
     more = {"fields": {"contrasts"}, "label_contacts": {"contact_totals"}}.get(name, set())
     assert (set(numbers) | more) - {"thickness"} == set(whole)
-    known = {"failed", "seconds", "memory", "request", *keys}
-    if name == "label_thickness":  # it is in the rows of labels
+    assert list(numbers["violated"]) == list(numbers["failed"])
+    known = {"failed", "violated", "seconds", "memory", "request", *keys}
+    if name == "label_layers":  # it is in the rows of labels
         assert all(row["thickness_mesh"] is None and row["dice"] > 0.0 for row in numbers["labels"])
         known |= {"labels"}
     assert all(numbers[key] == whole[key] for key in set(numbers) - known)

@@ -34,7 +34,7 @@ REFUSED = [
     ("--parts 2 --edge-size 9", "--edge-size: needs all"),
     ("--parts 2 --order 2", "--order: needs all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
-    ("--parts 4", "--parts: expected at most 3 for 300 nodes .100 each., got 4; use fewer"),
+    ("--parts 4", "--parts: expected at most 3 for 300 nodes .100 each., got 4$"),
     ("--parts 4 --predict", "--parts: expected at most 3 for 300 nodes"),
     ("--parts 2 --worker-gb 0", "--worker-gb: expected more than 0"),
     ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: only for workers on this machine"),

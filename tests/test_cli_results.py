@@ -51,6 +51,17 @@ def test_results_are_in_the_file_in_place_of_earlier_ones(folder, order, suffix,
     assert numbers_in(folder / "b.json")["results"] == "a.frd"
 
 
+def test_results_too_large_are_told(folder, order, monkeypatch, capsys):
+    """As by `tetopt fem`: with small numbers for large ones here."""
+    words = ["convert", folder / "a.vtu", folder / "b.vtu", "--results", folder / "a.frd", "--force"]
+    monkeypatch.setattr("tetopt.job.model.SMALL_FRACTION", 10.0)
+    assert exit_code(*words) == 0
+    assert "the largest displacement" not in capsys.readouterr().err
+    monkeypatch.setattr("tetopt.job.model.SMALL_FRACTION", 1e-9)
+    assert exit_code(*words) == 0
+    assert re.search(r"warning: .*a.frd: displacement: the largest displacement, .* mm, is", capsys.readouterr().err)
+
+
 def test_the_page_shows_them(folder, order):
     assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", "--results", folder / "a.frd") == 0
     assert exit_code("view", folder / "b.vtu", "--html", folder / "b.html") == 0

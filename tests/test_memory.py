@@ -103,7 +103,7 @@ IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(f
 LATTICE = tetopt.lattice_mesh(IMAGE, blocks=(2, 2, 2))
 LIMITS, CHANNELS = _block_limits(plain(IMAGE), 100, None), channels_of(plain(IMAGE))
 TASKS = {
-    "lattice: .* nodes: needs.*use fewer": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
+    r"lattice: .* nodes: needs.*use at most \d+ nodes$": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
         plain(IMAGE), CHANNELS, (4, 4, 4), LIMITS
     ),
@@ -112,7 +112,7 @@ TASKS = {
     "labels: 3 labels on 1512 .*division by 1 x 1 x 3.*: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
     "elasticity: the stiffness of .* cells with 10 nodes each: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
     "reference: 2160 degrees of freedom: needs.*`reference_dofs`": lambda: reference(IMAGE, 0.3),
-    "^octree: 100 nodes: needs.*use fewer": lambda: tetopt.mesh_image(IMAGE, 100),
+    r"^octree: 100 nodes: needs.*use at most \d+$": lambda: tetopt.mesh_image(IMAGE, 100),
     "^an image of 9 x 8 x 7 voxels: needs.*`crop`": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
 }
 

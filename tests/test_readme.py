@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import warnings
 from pathlib import Path
 
 import pytest
@@ -26,7 +28,9 @@ def test_program(tmp_path, monkeypatch, capsys):
     (program,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     names: dict = {}
-    exec(compile(program, "README.md", "exec"), names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # no defaults that are warned of
+        exec(compile(program, "README.md", "exec"), names)
     first, second, third = capsys.readouterr().out.splitlines()
     assert first == "all requirements are met"
     fraction, shape = re.fullmatch(r"unexplained variance (\S+), mean rho (\S+)", second).groups()
@@ -42,7 +46,7 @@ def test_program(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.full
-def test_commands(tmp_path, monkeypatch):
+def test_commands(tmp_path, monkeypatch, capsys):
     """The three `tetopt` commands, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [line for line in README.splitlines() if line.startswith("tetopt ") and "`" not in line]
     commands = [line for line in lines if re.match(r"tetopt (mesh|quality|convert) \S+\.", line)]
@@ -52,9 +56,18 @@ def test_commands(tmp_path, monkeypatch):
     for line in commands:
         words = [{"5000": "200"}.get(word, word) for word in shlex.split(line)[1:]]
         assert main(words) == 0, line
+        assert "warning" not in capsys.readouterr().err, line
     written = {"T1.nii.gz", "brain.vtu", "brain.inp", "run.json", "pictures"}
     assert {path.name for path in tmp_path.iterdir()} == written
     assert {path.name for path in (tmp_path / "pictures").iterdir()} >= {"slice.png", "rho.png"}
+
+
+def test_the_demo_compiles_for_all_later_commands():
+    """It keeps kernels where `tetopt` looks for them, not in the tests' folder."""
+    words = ["make", "-n", "-o", ".venv/.demo", "demo"]
+    made = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert "tetopt demo" in made
+    assert "NUMBA_CACHE_DIR" not in made
 
 
 def test_paths_and_targets_named_exist():

@@ -7,13 +7,19 @@ from commands import exit_code, numbers_in
 import tetopt
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
+from tetopt.job.advice import agreed, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.start.sizes import EdgeRatios, Sizes
 
 NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
 MESH = tetopt.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
+
+
+def told(*problems):
+    """Tell problems, as one list; return those that have a name."""
+    tell(agreed(problems))
+    return sentences(problems)
 
 
 @pytest.fixture
@@ -37,15 +43,13 @@ def said():
         ({"distance_p95": 8.0, "distance_mean": 2.0}, "8.0 voxels apart at the 95th percentile, 2.0 on average"),
         ({"reverse_p95": 8.0}, "8.0 voxels apart"),
         ({"distance_p95": np.nan, "reverse_p95": np.nan}, ""),
-        ({"mesh_euler": -47}, "Euler number of the mask's surface is 2, that of the mesh's boundary -47"),
-        ({"mesh_euler": 0}, ""),
-        ({"euler": -400, "mesh_euler": -390}, ""),
+        ({"mesh_euler": -47}, ""),  # a row of the table
         ({"mesh_components": 3}, ""),  # a requirement of its own
         ({"components": 3}, "the mask has 3 connected components, the mesh 1"),
     ],
 )
 def test_a_mask_that_the_mesh_does_not_show(said, change, words):
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR._replace(**change)}) == {}
+    assert told(*unmet({}, {"mask": NEAR._replace(**change)})) == {}
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
@@ -55,18 +59,16 @@ def test_what_background_leaves_is_no_mask(said):
     violated = {"mask": "the mesh and the mask overlap with a Dice of only 0.5"}
     far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
     words = "the mesh and the foreground overlap with a Dice of only 0.5"
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH, violated=violated), far, "foreground") == {
-        "mask": words
-    }
+    assert told(*unmet(violated, far, "foreground")) == {"mask": words}
     text = said()
     assert "the mask" not in text
-    assert text.count("foreground") >= text.count("\n") == 5
+    assert text.count("foreground") >= text.count("\n") == 4
 
 
 def test_components_that_were_dropped_are_told(said):
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 0}) == {}
+    assert told(*unmet({}, {"mask": NEAR, "dropped_components": 0})) == {}
     assert said() == ""
-    assert tell_violated(MeshingResult(MESH, [], "iterations", MESH), {"mask": NEAR, "dropped_components": 2}) == {}
+    assert told(*unmet({}, {"mask": NEAR, "dropped_components": 2})) == {}
     assert "dropped 2 connected components" in said()
 
 
@@ -82,7 +84,7 @@ def ended(E=0.5, E_D=0.5):
     ("result", "mode", "nodes", "measured", "words"),
     [
         (ended(), "graded", 100, {}, ""),
-        (ended(), "graded", 120, {}, "100 nodes instead of 120: use more iterations"),
+        (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations"),
         (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
         (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),
@@ -91,7 +93,7 @@ def ended(E=0.5, E_D=0.5):
     ],
 )
 def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
-    warn_of_result(result, "fast", mode, 100, nodes, measured, np.ones(2))
+    told(*of_result(result, "fast", mode, 100, nodes, measured, np.ones(2)))
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
@@ -99,7 +101,7 @@ def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
     for slices, words in ((1.5, "reduce `nodes`"), (5.5, "slices are 5.5 mm apart")):
-        warn_of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices]))
+        told(*of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices])))
         text = said()
         assert words in text
         assert ("reduce `nodes`" in text) == (slices < 2.0)
@@ -107,13 +109,13 @@ def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
 
 def test_limits_and_targets_that_edges_miss(said):
     edges = EdgeRatios(1.2, 0.05, 0.0, (), [])
-    warn_of_sizes(Sizes(longest=24.0, smallest=2.0), 2.0, 24.0, edges)
+    told(*of_sizes(Sizes(longest=24.0, smallest=2.0), 2.0, 24.0, edges))
     assert said() == ""
-    warn_of_sizes(Sizes(longest=24.0), 1.0, 28.8, None)
+    told(*of_sizes(Sizes(longest=24.0), 1.0, 28.8, None))
     assert "the longest edge is 28.8 mm, 20% over `edge_max` 24" in said()
-    warn_of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None)
+    told(*of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None))
     assert "the shortest edge is 1.5 mm, 25% under `size_min` 2" in said()
-    warn_of_sizes(Sizes(edge_size=5.0), 1.5, 28.8, edges._replace(above=0.4))
+    told(*of_sizes(Sizes(edge_size=5.0), 1.5, 28.8, edges._replace(above=0.4)))
     assert "40% of the edges are longer than 1.41 times their target size" in said()
 
 

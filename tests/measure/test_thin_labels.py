@@ -13,7 +13,7 @@ import tetopt
 from tetopt.contents.thickness import thickness_between
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.fidelity import LabelFidelity, Thickness, label_fidelity
-from tetopt.measure.thin import LabelContact, contact_totals, label_contacts, label_thickness
+from tetopt.measure.thin import LabelContact, contact_totals, label_contacts, label_layers, label_thickness
 from tetopt.report.tables import contact_table, contacts_in_words, thin_table
 
 
@@ -119,6 +119,13 @@ def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
     assert voxels == pytest.approx(cells, rel=0.03)
 
 
+def test_edges_are_those_of_the_labels_own_cells():
+    image, mesh, of_cell = blocky(slabs(3, 3))
+    row = label_layers(tetopt.content(image, image), mesh, of_cell)[2]
+    assert row.edge == pytest.approx(np.sqrt(2.0))  # each voxel's centre is in the middle one of its five cells
+    assert row.across == pytest.approx(row.voxels.p50 / row.edge, rel=1e-6)
+
+
 def test_percentiles_are_over_the_voxels():
     x, y = np.indices((20, 20))
     size = np.choose(np.searchsorted([6, 16], y, side="right"), [2, 4, 6])
@@ -169,7 +176,7 @@ def test_tables_have_the_worst_five_alone():
         texts(thin_table([rows[0]._replace(label=0, one_layer_fraction=1.0), *rows], {rows[0].label: "bone [l]"}))
         == shown
     )
-    assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "1.00", "2.00", "3.00", "-", "-", "-")
+    assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "2.00 (1.00 to 3.00)", "-", "-", "-")
     alike = [row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)) for row in rows]
     assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
     contacts = [LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)]

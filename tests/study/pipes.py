@@ -32,7 +32,7 @@ def crash_once(job):
     if not path.exists():
         path.write_text("once")
         crash(job)
-    return fine(job)
+    return fine(job)._replace(notes=[f"smoothing {job.smoothing:g}"])
 
 
 def crash_and_refuse(job):

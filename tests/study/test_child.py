@@ -15,7 +15,7 @@ import pytest
 import tetopt
 from tetopt.job.events import Event, listened
 from tetopt.study.child import run_in_child
-from tetopt.study.endings import last_line
+from tetopt.study.endings import AFTER_CRASHES, last_line
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.child import signal_words
 
@@ -57,8 +57,8 @@ def test_a_refusal_is_one_line():
 @pytest.mark.parametrize(
     ("pipeline", "line"),
     [
-        (pipes.crash, "twice crashed: signal 11, SIGSEGV"),
-        (pipes.wrap, "twice mine crashed (signal 11, SIGSEGV)"),
+        (pipes.crash, f"twice crashed: signal 11, SIGSEGV; {AFTER_CRASHES}"),
+        (pipes.wrap, f"twice mine crashed (signal 11, SIGSEGV); {AFTER_CRASHES}"),
         (pipes.quit_early, "ended with exit code 0 and no message"),
         (pipes.divide, "ZeroDivisionError: division by zero"),
         (pipes.leave, "ended with exit code 3 and no message"),
@@ -77,10 +77,13 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     events = []
     with listened(events.append):
         outcome = run_in_child(pipes.crash_once, JOB, "mine", max_seconds=60.0)
-    assert events == [Event("note", "mine: crashed: signal 11, SIGSEGV; running it again")]
+    said = "mine: crashed: signal 11, SIGSEGV; running it again, with smoother surfaces"
+    assert events == [Event("note", said)]
     assert (outcome.failure, outcome.reason) == (None, None)
     assert outcome.crashes == ("crashed: signal 11, SIGSEGV",)
-    assert outcome.notes == ["the first run crashed: signal 11, SIGSEGV; this is the second", "a note"]
+    first, last = outcome.notes
+    assert first.startswith("the first run crashed: signal 11, SIGSEGV; this is the second")
+    assert last == "smoothing 2"
     (tmp_path / "pid").unlink()
     outcome = run_in_child(pipes.crash_and_refuse, JOB, max_seconds=60.0)
     assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"

@@ -18,7 +18,7 @@ from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 import tetopt
-from tetopt.cli.console import log, open_streams, out, settle_streams, show_error, show_event, show_warning
+from tetopt.cli.console import log, open_streams, print_line, settle_streams, show_error, show_event, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
 from tetopt.errors import FORMER_NAMES, InputError, error_words
 from tetopt.job.events import listened
@@ -226,7 +226,7 @@ def _is_importable(name: str) -> bool:
 
 def _version(is_requested: bool) -> None:
     if is_requested:
-        out.print(f"tetopt {tetopt.__version__}")
+        print_line(f"tetopt {tetopt.__version__}")
         raise typer.Exit
 
 

@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from tetopt.cli.console import log, out, show_error, show_event
+from tetopt.cli.console import log, print_line, show_error, show_event
 from tetopt.cluster.crew import counted
 from tetopt.cluster.workers import local_share
 from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned, time_words
@@ -45,7 +45,7 @@ def cohort_command(
         log.print(f"nothing was run; problems to fix: {len(problems.lines)}")
         return 2
     if cohort.write_table is not None:
-        out.print(escape(f"{cohort.write_table}: {len(plan.entries)} subjects"))
+        print_line(f"{cohort.write_table}: {len(plan.entries)} subjects")
         return 0
     if cohort.dry_run:
         _say_estimate(plan)
@@ -61,17 +61,17 @@ def _say_estimate(plan: CohortPlan) -> None:
     to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
     for entry in to_run:
         if (one := estimate.get(entry.key)) is None:
-            out.print(escape(f"{entry.key}: size unknown because its image cannot be read"))
+            print_line(f"{entry.key}: size unknown because its image cannot be read")
         else:
-            out.print(escape(f"{entry.key}: {one.seconds:.0f} s on one thread, {memory_words(one.peak_bytes)}"))
+            print_line(f"{entry.key}: {one.seconds:.0f} s on one thread, {memory_words(one.peak_bytes)}")
     seconds = sum(one.seconds for one in estimate.values())
     peak = max((one.peak_bytes for one in estimate.values()), default=0.0)
     whole = f"in total {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
-        out.print(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
+        print_line(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
         return
     n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
-    out.print(f"{whole}; about {time_words(seconds / n_workers)} on this machine, {n_workers} at a time")
+    print_line(f"{whole}; about {time_words(seconds / n_workers)} on this machine, {n_workers} at a time")
 
 
 class _CohortDisplay:
@@ -124,12 +124,12 @@ class _CohortDisplay:
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
             log.print(escape(f"{row.key}: {row.reason}"))
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
-        out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
+        print_line(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
             more = f"the page also shows {counted(n_more, 'subject')} from other tables in {place}"
             log.print(escape(more))
         for name in (PAGE_NAME, TABLE_NAME):
-            out.print(escape(str(place / name)))
+            print_line(str(place / name))
         self.code = int(bool(counts["failed"] or counts["missing"]))
         if self.code and self._arguments:
             words_again = " ".join(map(shlex.quote, self._arguments))

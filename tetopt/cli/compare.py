@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from tetopt.cli.console import log, out, print_wide
+from tetopt.cli.console import log, print_line, print_table
 from tetopt.cli.options import ForceOption, ImageArgument, NumberOptions
 from tetopt.job.options import Option
 from tetopt.report.tables import add_quality, new_table
@@ -32,7 +32,7 @@ def paper_command(
     from tetopt.study.paper_files import reproduce
 
     page, seconds = reproduce(output, image, labels, seeds, force)
-    out.print(escape(f"{page}: the paper's numbers next to tetopt's; {seconds:.0f} s"))
+    print_line(f"{page}: the paper's numbers next to tetopt's; {seconds:.0f} s")
     return 0
 
 
@@ -50,7 +50,7 @@ def baseline_command(
     add_quality(table, made.quality)
     for step, seconds in made.seconds.items():
         table.add_row(f"seconds, {step}", f"{seconds:.1f}")
-    out.print(table)
+    print_table(table)
     return 0
 
 
@@ -73,13 +73,13 @@ def compare_command(
         return 130
     _print_headline(headline(report))
     n_pipelines = len(report.options.pipelines)
-    out.print(escape(f"{output / 'report.html'}: {n_pipelines} pipelines, {report.seconds:.0f} s"))
+    print_line(f"{output / 'report.html'}: {n_pipelines} pipelines, {report.seconds:.0f} s")
     return 0
 
 
 def _print_headline(first: Headline) -> None:
     """Print the page's first section: the pipelines, the main numbers, where tetopt is behind, and remarks."""
-    out.print(escape(first.title))
+    print_line(first.title)
     for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
         if claims:
             table = Table(title=title, box=None, title_justify="left")
@@ -89,6 +89,6 @@ def _print_headline(first: Headline) -> None:
                 numbers = (number_text(each.ours.value), number_text(each.other.value))
                 words = (escape(each.other_title), each.ratio_words, each.verdict, escape("; ".join(each.beside)))
                 table.add_row(escape(each.measure), *numbers, *words)
-            print_wide(table)
+            print_table(table)
     for line in first.remarks:
-        out.print(escape(line))
+        print_line(line)

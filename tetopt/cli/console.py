@@ -6,6 +6,8 @@ import errno
 import os
 import re
 import sys
+import textwrap
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from tetopt.io.text import plain
 if TYPE_CHECKING:
     from tetopt.job.events import Event
 
-WIDEST_TABLE = 500  # characters in a line
+LINE_WIDTH = 100  # characters in a line, but for words that are longer
 LONGEST_ERROR = 480  # characters: the remedy stands at the end, the value found may be a line of a million
 PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command line's names
     **{
@@ -124,12 +126,40 @@ def settle_streams() -> str | None:
     return reason
 
 
+def width_of(console: Console) -> int:
+    """Return the width of printed lines: that of the terminal, but at most `LINE_WIDTH`."""
+    return min(console.width, LINE_WIDTH) if console.is_terminal else LINE_WIDTH
+
+
+def wrapped(text: str, console: Console) -> list[str]:
+    """Break a line between words, where it is wider than allowed; long words, as paths, are kept whole."""
+    width = width_of(console)
+    return textwrap.wrap(text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False) or [""]
+
+
+def print_line(text: str) -> None:
+    """Print a line of the result on standard output, wrapped."""
+    for line in wrapped(plain(text), out):
+        out.print(escape(line))
+
+
 def show_error(message: object) -> None:
-    """Print an error on one line of limited length, with the command's names for options."""
+    """Print an error with the command's names for options: on one line of limited length, which a terminal wraps."""
     line = plain(in_options(str(message)))
     if len(line) > LONGEST_ERROR:  # it quotes a file
         line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 3 :]}"
-    log.print(f"[bold red]tetopt:[/] {escape(line)}")
+    _say(f"tetopt: {line}", "tetopt:", "bold red", is_wrapped=log.is_terminal)
+
+
+def _say(line: str, head: str = "", style: str = "", is_wrapped: bool = True) -> None:
+    """Print a line on standard error, its head in a style."""
+    first, *rest = wrapped(line, log) if is_wrapped else [line]
+    if head and first.startswith(head):
+        log.print(f"[{style}]{head}[/]{escape(first.removeprefix(head))}")
+    else:
+        log.print(escape(first))
+    for each in rest:
+        log.print(escape(each))
 
 
 def in_options(message: str) -> str:
@@ -149,7 +179,7 @@ def with_hyphens(message: str) -> str:
 
 def say(text: str) -> None:
     """Print a line of the library."""
-    log.print(escape(with_hyphens(text)))
+    _say(plain(with_hyphens(text)))
 
 
 def show_event(event: Event) -> None:
@@ -159,35 +189,54 @@ def show_event(event: Event) -> None:
     elif event.kind == "warning":
         show_warning(event.text)
     elif event.kind == "violated":
-        show_error(event.text)
+        _say(f"tetopt: {plain(in_options(event.text))}", "tetopt:", "bold red")
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Print a warning on one line; replaces `warnings.showwarning`."""
-    log.print(f"[yellow]tetopt: warning:[/] {escape(plain(with_hyphens(str(message))))}")
+    """Print a warning; replaces `warnings.showwarning`."""
+    _say(f"tetopt: warning: {plain(with_hyphens(str(message)))}", "tetopt: warning:", "yellow")
 
 
-def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> None:
+def print_verdict(violated: Iterable[str], words: str) -> None:
+    """Print the last line of a command: whether the mesh meets all requirements, and the mesh in words."""
+    names = ", ".join(violated)
+    print_line(f"requirements not met: {names}; {words}" if names else f"all requirements are met; {words}")
+
+
+def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False) -> None:
     """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured` (`tetopt.report.summary`).
 
-    `ndim` is the mesh's dimension; `word` is the name of the mask.
+    `ndim` is the mesh's dimension; `word` is the name of the mask; `every` prints all labels and all their measures.
     """
     # these import numba and more
-    from tetopt.report.tables import label_differences, label_table, mask_table, sizes_in_words
+    from tetopt.report.tables import mask_table, sizes_in_words
 
     if "edges_over_target" in measured:
-        out.print(escape(sizes_in_words(measured["edges_over_target"])))
+        print_line(sizes_in_words(measured["edges_over_target"]))
     for row in measured.get("contrasts", []):
         fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
-        out.print(escape(f"{row['image']}: weight {row['weight']:g}, unexplained variance {fraction}"))
+        print_line(f"{row['image']}: weight {row['weight']:g}, unexplained variance {fraction}")
     if "mask" in measured:
-        print_wide(mask_table(measured["mask"], ndim, word))
+        print_table(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:
-        rows, interfaces, names = measured["labels"], measured["interfaces"], measured.get("label_names", {})
-        print_wide(label_table(rows, interfaces, names, ndim))
-        for line in label_differences(rows, interfaces, names):
-            out.print(escape(line))
+        _print_labels(measured, ndim, every)
     _print_thin(measured, ndim)
+
+
+def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
+    """Print the labels: the worst, or every one with all measures."""
+    from tetopt.report.tables import label_differences, label_table, surface_table, worst_labels
+
+    names, n_labels = measured.get("label_names", {}), len(measured["labels"])
+    places = worst_labels(measured["labels"], *([None] if every else []))
+    rows, interfaces = ([measured[name][place] for place in places] for name in ("labels", "interfaces"))
+    print_table(label_table(rows, names, ndim))
+    if len(places) < n_labels:
+        print_line(f"the {len(places)} of {n_labels} labels with the lowest Dice; `tetopt quality --all` prints all")
+    if every:
+        print_table(surface_table(rows, interfaces, names))
+    for line in label_differences(rows, interfaces, names):
+        print_line(line)
 
 
 def _print_thin(measured: dict[str, Any], ndim: int) -> None:
@@ -196,14 +245,13 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
 
     names = measured.get("label_names", {})
     if "labels" in measured:
-        print_wide(thin_table(measured["labels"], names))
+        print_table(thin_table(measured["labels"], names))
     if "contacts" in measured:
         if (table := contact_table(measured["contacts"], names, ndim)) is not None:
-            print_wide(table)
-        out.print(escape(contacts_in_words(measured["contact_totals"], ndim)))
+            print_table(table)
+        print_line(contacts_in_words(measured["contact_totals"], ndim))
 
 
-def print_wide(table: Table) -> None:
-    """Print a table at its full width, also into a pipe, which has no width."""
-    width = out.measure(table, options=out.options.update(width=WIDEST_TABLE)).maximum
-    _Console(file=out.file, width=max(out.width, width), highlight=False, emoji=False).print(table)
+def print_table(table: Table) -> None:
+    """Print a table in the width of the terminal, or in 100 columns into a pipe, which has no width."""
+    _Console(file=out.file, width=width_of(out), highlight=False, emoji=False).print(table)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from rich.markup import escape
-
-from tetopt.cli.console import out, show_event
+from tetopt.cli.console import print_line, show_event
 from tetopt.cli.options import NumberOptions, mesh_and_image
 from tetopt.cli.solver import print_model
 from tetopt.errors import InputError
@@ -57,6 +55,6 @@ def convert_command(
 def _show(event: Event) -> None:
     """Show an event; the magnitudes of results go to standard output."""
     if event.kind == "progress":
-        out.print(escape(event.text))
+        print_line(event.text)
     else:
         show_event(event)

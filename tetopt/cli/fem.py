@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import InputError
-from tetopt.cli.console import print_wide
+from tetopt.cli.console import print_table
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
@@ -20,6 +20,7 @@ from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
 from tetopt.system.files import checked_output
 
+STEPS_BESIDE = 3  # columns of a table
 SHOWN_FRACTION = 1e-9  # of a force's largest component: less is the residual of an iterative solution
 
 
@@ -65,7 +66,8 @@ def fem_command(
         mesh_path, image_path, output, model=model, part=part, compress=compress,
         conditioning=conditioning,
     )  # fmt: skip
-    _print(mesh_path.name, came)
+    for first in range(0, len(came.solutions), STEPS_BESIDE):
+        _print(mesh_path.name, came, slice(first, first + STEPS_BESIDE))
     numbers.save(came.numbers)
     return 0
 
@@ -84,17 +86,18 @@ def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
     yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
-def _print(name: str, came: SolvedModel) -> None:
-    """Print a table with a column for each step."""
-    model, solutions, extremes = came.model, came.solutions, came.extremes
-    steps = [f"step {step}" for step in range(1, len(solutions) + 1)] if len(solutions) > 1 else [""]
+def _print(name: str, came: SolvedModel, shown: slice) -> None:
+    """Print a table with a column for each of some steps; that of the first ones describes the model, too."""
+    model, solutions, extremes = came.model, came.solutions[shown], came.extremes if shown.start == 0 else None
+    steps = [f"step {step}" for step in range(1, len(came.solutions) + 1)][shown] if len(came.solutions) > 1 else [""]
     table = new_table(escape(name), *steps)
-    moduli = [solutions[0].young.min(), solutions[0].young.max()]
-    table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")
-    table.add_row("modulus of the cells, kPa", f"{moduli[0]:.4g} to {moduli[1]:.4g}")
-    for title, words in _of_what(came):
-        table.add_row(title, words)
-    of_step = came.numbers["steps"]
+    if shown.start == 0:
+        moduli = [solutions[0].young.min(), solutions[0].young.max()]
+        table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")
+        table.add_row("modulus of the cells, kPa", f"{moduli[0]:.4g} to {moduli[1]:.4g}")
+        for title, words in _of_what(came):
+            table.add_row(title, words)
+    of_step = came.numbers["steps"][shown]
     table.add_row("largest displacement, mm", *(f"{each['largest_displacement']:.5g}" for each in of_step))
     table.add_row("largest von Mises stress of a cell, kPa", *(f"{each['largest_von_mises']:.5g}" for each in of_step))
     table.add_row("strain energy, uJ", *(f"{each['strain_energy']:.8g}" for each in of_step))
@@ -111,7 +114,7 @@ def _print(name: str, came: SolvedModel) -> None:
         table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{extremes.lambda_max:.6g}")
         table.add_row("condition number, 2-norm", f"{extremes.cond:.6g}")
         table.add_row("Jacobi CG iterations to 1e-10", str(extremes.cg_iterations))
-    print_wide(table)
+    print_table(table)
 
 
 def _vector(force: NDArray[np.float64]) -> str:

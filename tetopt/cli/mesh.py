@@ -6,9 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
-from rich.markup import escape
-
-from tetopt.cli.console import out, print_fidelity
+from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
 from tetopt.cli.options import ForceOption, PredictOption
 from tetopt.cli.predict import print_parts, print_prediction
@@ -35,6 +33,9 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
         result = run(job, display, display.is_over)
         display.end_stage()
         _print(result)
+        display.close()  # the mesh's problems, before the last line
+        size = f"{nodes_in_words(result.mesh, result.model.order)}, {len(result.mesh.cells)} cells"
+        print_verdict(result.violated, f"{job.output}: {size}")
         return signal_code() if is_ended() else int(bool(result.violated))
 
 
@@ -60,24 +61,16 @@ def _print(result: Result) -> None:
     print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
     if has_model(job) or job.output.suffix.lower() != ".vtu":
         print_model(job.output, model, job)
-    else:
-        size = f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells"
-        out.print(escape(f"{job.output}: {size}"))
     if job.json_path is not None:
-        out.print(escape(f"{job.json_path}: every number of the run"))
+        print_line(f"{job.json_path}: every number of the run")
     for path in task.plan.pictures:
-        out.print(escape(str(path)))
+        print_line(str(path))
 
 
 def _print_comparison(result: Result, n_empty: int) -> None:
     content, order = result.task.source.content, result.model.order
     first, last = result.optimized.history[0], result.optimized.history[-1]
     table = new_table("", result.task.start_name, "optimised")
-    is_tense = result.optimized.labels is not None  # as soon as cells have labels
-    table.add_row("E, combined (last with tension)" if is_tense else "E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
-    table.add_row("E_G, relative to initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
-    if first.E_D > 0.0:
-        table.add_row("E_D, relative to initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         table.add_row(
             f"E_D, fraction of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
@@ -89,7 +82,7 @@ def _print_comparison(result: Result, n_empty: int) -> None:
         add_quality(table, first_shape, last_shape, in_all=in_all)
     if n_empty:
         table.add_row("cells without a voxel centre", "", str(n_empty))
-    out.print(table)
+    print_table(table)
 
 
 def demo_command(

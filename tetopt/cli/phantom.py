@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from rich.markup import escape
 
 from tetopt import Image, InputError, load_phantom, save_image
-from tetopt.cli.console import out
+from tetopt.cli.console import print_line
 from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
@@ -47,5 +46,5 @@ def phantom_command(
     if labels is not None:
         save_image(labels, phantom.label_image(voxel_mm=voxel_mm))
     size = " x ".join(str(s) for s in voxels.shape)
-    out.print(escape(f"{output}: {phantom.name}, {size} voxels, {low:g} to {high:g}"))
+    print_line(f"{output}: {phantom.name}, {size} voxels, {low:g} to {high:g}")
     return 0

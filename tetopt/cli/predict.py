@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numba
 
-from tetopt.cli.console import log, out, show_warning
+from tetopt.cli.console import log, print_line, show_warning
 from tetopt.cluster.crew import Need, counted
 from tetopt.engine.cost import calibrated_speed, cost_model, predicted
 from tetopt.job.task import Task
@@ -19,15 +19,15 @@ def print_prediction(task: Task) -> None:
     threads, model = numba.get_num_threads(), cost_model()
     prediction = predicted(size, threads, calibrated_speed())
     seconds, factor = prediction.seconds, model.seconds_factor
-    out.print(
+    print_line(
         f"{_seconds(seconds)} on {threads} thread{'s' if threads > 1 else ''}, in nine of ten cases "
         f"{_seconds(seconds / factor)} to {_seconds(seconds * factor)}, if the machine is idle and the kernels are "
         "compiled"
     )
     n_bytes, fraction = prediction.peak_bytes, model.bytes_fraction
-    out.print(f"{memory_words(n_bytes)} of memory at peak, in nine of ten cases within {fraction:.0%}")
+    print_line(f"{memory_words(n_bytes)} of memory at peak, in nine of ten cases within {fraction:.0%}")
     if task.plan.job.target_error is not None:
-        out.print(f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many are needed")
+        print_line(f"assuming {size.runs} runs with {size.n_nodes} nodes: only the run shows how many are needed")
     free = available_bytes()
     if n_bytes > free:
         show_warning(f"only {memory_words(free)} of memory is free, less than this run needs; reduce --nodes or crop")
@@ -43,7 +43,7 @@ def print_parts(task: Task) -> None:
     number, n_bytes = task.plan.division.expected(task.source.contrasts[0], nodes)
     need = Need(number, n_bytes, job.threads, is_within=True)
     own = OCTREE_NODE_BYTES * nodes
-    out.print(
+    print_line(
         f"about {counted(number, 'part')} per round, each up to {memory_words(n_bytes)} of memory "
         f"({memory_words(need.limit_for(n_bytes))} with its worker); about {memory_words(own)} for this command, "
         "which builds the octree in one piece"

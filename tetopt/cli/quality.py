@@ -8,13 +8,13 @@ from typing import Annotated
 from rich.markup import escape
 from rich.table import Table
 
-from tetopt.cli.console import out, print_fidelity
+from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.job.judge import Judgement, judge
 from tetopt.job.options import ImagePart, LabelNamesOption, MaskPart, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
-from tetopt.report.tables import add_quality, new_table
+from tetopt.report.tables import add_quality, new_table, nodes_in_words
 
 
 def quality_command(
@@ -30,6 +30,7 @@ def quality_command(
         ),
     ] = False,
     label_names: LabelNamesOption = None,
+    every: Annotated[bool, Option(None, "Print all measures, and all labels.", "all")] = False,
     *,
     part: ImagePart,
     region: MaskPart,
@@ -43,14 +44,19 @@ def quality_command(
     size, source = came.numbers["size"], came.source
     table = new_table("", escape(mesh.name))
     in_all = [size["n_nodes_in_all"]] if came.loaded.order == 2 else []
-    add_quality(table, came.shape, in_all=in_all, jacobian=came.numbers.get("min_scaled_jacobian"))
+    add_quality(table, came.shape, in_all=in_all, jacobian=came.numbers.get("min_scaled_jacobian"), every=every)
     if source is not None and came.fit is not None:
-        _add_fit(table, came.fit, source, came.left_out)
-    out.print(table)
-    print_fidelity(came.measured, came.loaded.mesh.ndim, "mask" if source is None else source.mask_word)
+        _add_fit(table, came.fit, source, came.left_out, every)
+    print_table(table)
+    word = "mask" if source is None else source.mask_word
+    print_fidelity(came.measured, came.loaded.mesh.ndim, word, every)
     if check and not came.numbers["problems"]:
-        out.print(f"checked: conforming, oriented{_checked_words(came)}")
-    return int(bool(came.tell()))
+        print_line(f"checked: conforming, oriented{_checked_words(came)}")
+    wrong = came.tell()
+    if check:
+        whole = f"{nodes_in_words(came.loaded.mesh, came.loaded.order)}, {size['n_cells']} cells"
+        print_verdict(came.numbers["violated"], f"{mesh}: {whole}")
+    return int(bool(wrong))
 
 
 def _checked_words(came: Judgement) -> str:
@@ -60,9 +66,10 @@ def _checked_words(came: Judgement) -> str:
     return ", in one piece" + (", fills the box" if came.source is not None and came.is_filled else "")
 
 
-def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str]) -> None:
+def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str], every: bool) -> None:
     """Add rows on how well cells fit an image, and name the inputs of the mesh's run that are left out."""
-    table.add_row("E_D", f"{fit.E_D:.6g}")
+    if every:
+        table.add_row("E_D", f"{fit.E_D:.6g}")
     if fit.E_D_fraction_of_variance is not None:
         words = f", without its {' and '.join(left_out)}" if left_out else ""
         table.add_row(

@@ -32,7 +32,8 @@ class Display:
     def __init__(self, begin_keeping: Callable[[], None]) -> None:
         self._begin_keeping = begin_keeping
         self._shown = ExitStack()
-        self._violated: list[Event] = []  # printed last, where they are seen
+        self._held: list[Event] = []  # problems of the mesh: printed last, where they are seen
+        self._is_writing = False
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
         self._n_rows = 0  # iterations so far; 0 if there are none
@@ -43,10 +44,11 @@ class Display:
         self._shown.close()
 
     def close(self) -> None:
-        """End the display, and print the violated requirements."""
+        """End the display, and print the mesh's problems: violated requirements, then warnings."""
         self.end_stage()
-        while self._violated:
-            show_event(self._violated.pop(0))
+        self._held.sort(key=lambda event: event.kind != "violated")
+        while self._held:
+            show_event(self._held.pop(0))
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
@@ -55,8 +57,8 @@ class Display:
             self._start(event.data, event.text)
         elif event.kind == "progress":
             self._tell(event)
-        elif event.kind == "violated":
-            self._violated.append(event)
+        elif event.kind == "violated" or (event.kind == "warning" and self._is_writing):
+            self._held.append(event)
         else:
             show_event(event)
 
@@ -86,6 +88,7 @@ class Display:
             self._tell = self._shown.enter_context(_parts_bar(self._begin_keeping))
         if stage.name in ("optimised", "write"):
             self._n_rows = 0
+        self._is_writing = stage.name == "write"
 
 
 @contextlib.contextmanager

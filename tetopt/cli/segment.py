@@ -7,11 +7,10 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.markup import escape
 
 import tetopt
 from tetopt import Content, InputError, Mesh, save_image
-from tetopt.cli.console import out, show_warning
+from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.energy.sampling import overlap_of
 from tetopt.job.inputs import content_within, read_labels, read_mesh, warn_of_other_image
@@ -71,10 +70,10 @@ def segment_command(
             overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
     save_image(output, labels)
     numbers.save(report)
-    out.print(table)
+    print_table(table)
     if truth is not None:
-        out.print(overlaps)
-    out.print(escape(f"{output}: {classes} classes on {labels.data.size} voxels"))
+        print_table(overlaps)
+    print_line(f"{output}: {classes} classes on {labels.data.size} voxels")
     return 0
 
 

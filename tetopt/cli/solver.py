@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from rich.markup import escape
 
-from tetopt.cli.console import out, print_wide
+from tetopt.cli.console import print_line, print_table
 from tetopt.io.formats import format_of
 from tetopt.io.gmsh import incomplete_groups
 from tetopt.io.tags import group_of_zero, label_lines, numbered_parts
@@ -22,6 +22,7 @@ from tetopt.model.materials import Materials
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.report.tables import new_table, nodes_in_words
 
+MOST_SETS = 20  # printed of facets, of cells, and of materials
 GMSH_SUFFIXES = (".msh", ".msh2")
 CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word for the number of a cell
 
@@ -29,15 +30,17 @@ CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
     """Print the contents of the file: sets, materials and the error of binning, units, coordinates."""
     for line in _lines(output, model, solver):
-        out.print(escape(line))
+        print_line(line)
     if format_of(output).is_surface:
         return
-    table, cells = new_table("set", "facets", "nodes", "cells"), elements(model)[1]
-    for name, rows in model.sets.facets.items():
+    table, cells, sets = new_table("set", "facets", "nodes", "cells"), elements(model)[1], model.sets
+    for name, rows in list(sets.facets.items())[:MOST_SETS]:
         table.add_row(escape(name), str(len(rows)), str(len(np.unique(element_facets(cells, rows)))), "")
-    for name, members in model.sets.cells.items():
+    for name, members in list(sets.cells.items())[:MOST_SETS]:
         table.add_row(escape(name), "", "", str(len(members)))
-    print_wide(table)
+    print_table(table)
+    if more := len(sets.facets) + len(sets.cells) - table.row_count:
+        print_line(f"and {more} more sets")
 
 
 def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
@@ -49,6 +52,9 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
     if len(pairs) > len(np.unique(labels)):
         return
     for number, (young, nu) in enumerate(zip(materials.young, materials.nu, strict=True)):
+        if number == MOST_SETS:
+            yield f"  and {len(materials.young) - MOST_SETS} more materials"
+            return
         made_of = [names.get(label, str(label)) for label, material in pairs if material == number]
         yield f"  {young:.4g} kPa, nu {nu:.4g}: {listed(made_of)}"
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from rich.markup import escape
 
-from tetopt.cli.console import out
+from tetopt.cli.console import print_line, print_table
 from tetopt.cli.options import MeshArgument, NumberOptions
 from tetopt.io.surfaces import SURFACE_SUFFIXES
 from tetopt.job.options import Option
@@ -30,8 +30,8 @@ def surface_command(
     table = new_table(*map(escape, written.heads))
     for row in written.rows:
         table.add_row(*map(escape, row))
-    out.print(table)
+    print_table(table)
     for line in written.lines:
-        out.print(line)
+        print_line(line)
     numbers.save(written.numbers)
     return 0 if written.is_sound else 1

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from rich.markup import escape
 
 from tetopt import InputError
-from tetopt.cli.console import out
+from tetopt.cli.console import print_line
 from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
 from tetopt.job.inputs import content_within, label_table, number_of, read_mesh, warn_of_other_image
 from tetopt.job.options import BoxPart, ImagePart, MaskPart, Option
@@ -67,14 +66,14 @@ def view_command(
         from tetopt.report.scene import opened_mesh, save_scenes
 
         save_scenes(screenshot, [("", opened_mesh(shown))])
-        out.print(escape(str(screenshot)))
+        print_line(str(screenshot))
     if html is not None or screenshot is None:
         from tetopt.report.explore import save_explorer
 
         page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
         save_explorer(page, shown)
         words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
-        out.print(escape(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained"))
+        print_line(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained")
     return 0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from rich.markup import escape
 
 from tetopt import (
     Image,
@@ -17,7 +16,7 @@ from tetopt import (
     mask_fidelity,
     mesh_image,
 )
-from tetopt.cli.console import out
+from tetopt.cli.console import print_line
 from tetopt.cli.run import compiling
 from tetopt.contents.content import content
 from tetopt.fem.reference import reference
@@ -40,7 +39,7 @@ def warm_up_command() -> int:
             _mesh_balls(n)
         reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)
     seconds = time.perf_counter() - begin
-    out.print(escape(f"all kernels are ready after {seconds:.0f} s, stored in {place.folder}"), soft_wrap=True)
+    print_line(f"all kernels are ready after {seconds:.0f} s, stored in {place.folder}")
     return 0
 
 

@@ -212,10 +212,12 @@ def followed(
 ) -> tuple[list[IterationRecord], str]:
     """Do the iterations of a course; return the records and "iterations", "converged" or "over"."""
     history: list[IterationRecord] = []
-    min_dihedral, nodes = course.min_dihedral, course.nodes
+    min_dihedral, nodes, E = course.min_dihedral, course.nodes, 0.0
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
+        nonlocal E
         history.append(run.record(iteration, movement, is_changed, time.perf_counter() - begin))
+        E = run.E()
         if callback is not None:
             callback(history[-1])
 
@@ -241,7 +243,7 @@ def followed(
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
         is_new = is_labelled or (has_labels and not run.has_labels)  # E is defined differently: nothing has settled yet
-        fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
+        fall = np.inf if is_new else 1.0 - run.E() / E if E > 0.0 else 0.0
         # 3. Exchange nodes: in every second of the first iterations.
         if nodes is not None and does_exchange and not is_over():
             n_changes += run.exchange_towards(nodes, course.sizes)
@@ -342,7 +344,7 @@ class Run:
         return int(self.state.complex.n_cells[0])
 
     def E(self) -> float:
-        """The combined energy, Eq. (4)."""
+        """The combined energy that moves lower: Eq. (4), or with labels that of their own values, and tension."""
         E_G, squares = content_energies(self.state, self.content)
         objective = self.state.objective
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
@@ -547,13 +549,14 @@ class Run:
         return relative_movement(before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix)
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> IterationRecord:
-        """The history's row for the current state."""
+        """The history's row for the current state; its E has no tension, and is comparable across the whole run."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
         E_G, squares = content_energies(self.state, self.content, self.content.n_channels)
         n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
+        E = self.state.objective.geometry * E_G + self.state.objective.image * squares
         E_D = squares * self.content.unit * self.image.voxel_volume
-        return IterationRecord(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
+        return IterationRecord(iteration, E, E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
 
     def labels(self) -> NDArray[np.int64] | None:
         """The label of each cell, (M,); None without labels."""

@@ -44,7 +44,7 @@ from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
-from tetopt.system.budget import check_memory
+from tetopt.system.budget import at_most, check_memory
 
 Mode = Literal["graded", "uniform", "paper", "start"]
 EarlierRuns = list[tuple[NDArray, int, int]]  # points of the initial mesh, and nodes requested and reached
@@ -272,8 +272,10 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     """Raise InputError for more nodes than fit into memory, or into `limit` bytes in total."""
     shape = " x ".join(map(str, content.image.shape))
     what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
-    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or raise the memory limit", limit)
-    check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "use fewer nodes", limit)
+    bare, need = bytes_of(content, 0), bytes_of(content, nodes)
+    check_memory(bare, what, "mesh a part of it (`crop`), or raise the memory limit", limit)
+    each = (need - bare) / max(nodes, 1) or 1.0
+    check_memory(need, f"{nodes} nodes on {what}", lambda room: at_most((room - bare) / each, "nodes"), limit)
 
 
 def _with_defaults(mode: Mode, options: dict[str, Any], **stated: Any) -> dict[str, Any]:

@@ -50,9 +50,9 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
     Returns
     -------
     MeshingResult
-        With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral angle, if the run
-        moved any nodes. `box`: nodes farther beyond the image's box than the initial mesh's. `cover`: voxels or volume
-        lost or gained relative to the initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
+        With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes
+        farther beyond the image's box than the initial mesh's. `cover`: voxels or volume lost or gained relative to the
+        initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
         two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask.
         `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
         manifold. `labels`: labels of more than 200 voxels without cells. A requirement that cannot be checked, for lack
@@ -97,12 +97,13 @@ def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> M
 
 def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[str, str]:
     mesh = result.mesh
-    if mesh.ndim != 3 or result.history[-1].iteration == 0:
+    if mesh.ndim != 3:
         return {}
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
     words = f"{below} of {len(angles)} cells have a dihedral angle below {min_dihedral:g} degrees, down to "
-    words += f"{angles.min():.2f}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"
+    first = "more `iterations`, as none was made" if result.history[-1].iteration == 0 else "more nodes, a lower `k_D`"
+    words += f"{angles.min():.2f}; allow {first}, or a lower `min_dihedral`"
     return {"min_dihedral": words} if below else {}
 
 

@@ -31,7 +31,7 @@ from tetopt.geometry.box import upright_axis
 from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.budget import check_memory
+from tetopt.system.budget import at_most, check_memory
 
 # Of memory per dof, for a solution and everything derived; 70 were measured at 27 million, 110 at 3 million.
 DOF_BYTES = 100
@@ -100,7 +100,8 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
     n_dofs = modulus.ndim * float(np.prod(np.array(modulus.shape) + 1))
-    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "use fewer (`reference_dofs`)")
+    what = f"reference: {n_dofs:.4g} degrees of freedom"
+    check_memory(DOF_BYTES * n_dofs, what, lambda room: f"{at_most(room / DOF_BYTES)} (`reference_dofs`)")
     grid = grid_of(modulus, nu)
     push = push_of(modulus, percent)
     half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))

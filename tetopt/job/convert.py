@@ -16,11 +16,12 @@ from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.events import note, progress
+from tetopt.job.events import note, progress, warning
 from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
+    large_words,
     loads_of,
     model_of_file,
     save_for_solver,
@@ -114,6 +115,11 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
         if values.shape[1:] != (9,):  # tensors come with their von Mises stress
             largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
             progress(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}")
+            how = (
+                "too large for a linear solution; check loads, units and fixed sets, unless the solver's was nonlinear"
+            )
+            if values.shape[1:] == (3,) and (words := large_words(loaded.mesh, largest, how)):
+                warning(f"{path}: {name}: {words}")
     loaded = without_results(loaded)
     sets = _sets_with_input(loaded, path.with_suffix(".inp"))
     return loaded._replace(point_data=loaded.point_data | results.point_data, order=results.order, sets=sets)

@@ -13,8 +13,7 @@ from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
-from tetopt.job.advice import tell_violated
-from tetopt.job.events import violated, warning
+from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
 from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
 from tetopt.job.request import checksum
@@ -68,30 +67,33 @@ class Judgement(NamedTuple):
     def requirements(self) -> dict[str, Any]:
         """Requirements of the run that built the mesh, from its file; another program's mesh need only fill the box."""
         options = self.loaded.table("options")  # only tetopt's have a method
-        is_kept = options.get("method") == "fast" and options.get("iterations") != 0
+        is_fast = options.get("method") == "fast"
         return {
-            "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_kept else 0.0,
+            "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_fast else 0.0,
             "target_error": None if self.left_out else _number(options.get("target_error")),
             "is_filled": "method" in options and self.is_filled,
         }
 
     def tell(self) -> list[str]:
-        """Report the mesh's problems and return them, a line each; remarks are warnings."""
-        problems: list[str] = self.numbers.get("problems", [])
-        for remark in self.numbers.get("remarks", []):
-            warning(f"{self.path}: {remark}")
+        """Report the mesh's problems; return a line on each that makes it fail."""
+        problems = self.problems()
+        tell(problems)
+        return [each.words for each in problems if each.name is not None]
+
+    def problems(self) -> list[Problem]:
+        """Return the mesh's problems, worst first; those with a name make it fail."""
+        wrong: list[str] = self.numbers.get("problems", [])
         overlap = None if self.fit is None else self.fit.overlap
-        wrong = [f"{self.path}: {problem}" for problem in (*problems, *([] if overlap is None else [overlap]))]
-        for line in wrong:
-            violated(line)
-        if self.source is None or self.result is None:
-            return wrong
-        known = ("overlap", "manifold") if problems else ("overlap",)  # reported above, with numbers of cells or nodes
-        unmet = {name: words for name, words in self.result.violated.items() if name not in known}
-        measured = self.measured
-        if not self.is_checked:  # only what makes the numbers above meaningless
-            unmet, measured = {name: words for name, words in unmet.items() if name == "mask"}, {}
-        return [*wrong, *tell_violated(self.result._replace(violated=unmet), measured, self.source.mask_word).values()]
+        named = [("mesh", each) for each in wrong] + ([] if overlap is None else [("overlap", overlap)])
+        problems = [Problem(f"{self.path}: {each}", name=name, is_failure=True) for name, each in named]
+        if self.source is not None and self.result is not None:
+            known = ("overlap", "manifold") if wrong else ("overlap",)  # named above, with numbers of cells or nodes
+            requirements = {name: words for name, words in self.result.violated.items() if name not in known}
+            measured = self.measured
+            if not self.is_checked:  # only what makes the numbers meaningless
+                requirements, measured = {name: words for name, words in requirements.items() if name == "mask"}, {}
+            problems += unmet(requirements, measured, self.source.mask_word)
+        return agreed([*problems, *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", []))])
 
 
 def judge(
@@ -130,7 +132,8 @@ def judge(
     if check:
         problems, remarks = _checked(judgement)
         numbers |= {"problems": problems, "remarks": remarks}
-        numbers |= {} if judgement.result is None else {"violated": dict(judgement.result.violated)}
+    if check or image is not None:
+        numbers["violated"] = sentences(judgement.problems())
     return judgement
 
 

@@ -57,6 +57,7 @@ REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
 # Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the cells.
 MANY_INTERFACES = 24
+SMALL_FRACTION = 0.1  # of the mesh's length: larger displacements are not small, with strains of about 10 %
 INTERFACE_PREFIX = "interface_"  # of names of facet sets between two labels
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with one material per cell (tests/benchmarks)
 
@@ -157,6 +158,17 @@ def solver_model(
         cell_data=fields, known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
     return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
+
+
+def large_words(mesh: Mesh, moved: float, how: str) -> str | None:
+    """Describe the largest displacement `moved`, mm, if it is not small against the mesh's length; `how` is the advice.
+
+    Loads in other units, or a set that is not fixed, show in it first.
+    """
+    size = float(np.ptp(mesh.points, axis=0).max())
+    if not moved > SMALL_FRACTION * size:
+        return None
+    return f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length, {how}"
 
 
 def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:

@@ -72,7 +72,7 @@ def read_planned(plan: Plan) -> Task:
             source = source.with_table(label_table(None, begun))
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
     if by_label is not None:
-        tell_label_sizes(by_label, plan.job.cells_across, source.table)
+        tell_label_sizes(by_label)
     n_started = None if begun is None else len(begun.mesh.points)
     size = size_of_run(plan, source.content, source.contrasts[0], n_started, sizes)
     # With the files' current checksums.

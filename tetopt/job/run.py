@@ -8,9 +8,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from tetopt.engine.loop import MeshingResult
+from tetopt.errors import error_words
 from tetopt.geometry.quadratic import node_count
-from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
-from tetopt.job.events import Listener, listened, violated
+from tetopt.job.advice import Problem, agreed, failures, of_layers, of_result, of_sizes, sentences, tell, unmet
+from tetopt.job.events import Listener, listened
 from tetopt.job.in_parts import end_parts
 from tetopt.job.job import Job
 from tetopt.job.meshing import meshed
@@ -123,16 +124,32 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
         measured = measured_of(task, came.result, model, failed)
         numbers = numbers_of(task, came, shapes, model, about, time.perf_counter() - begin)
         missing = {name: None for name in (*failed, "cells_without_voxel") if name != "fields"}
-        numbers |= missing | measured | {"failed": failed} | model_summary(model)
+        numbers |= missing | measured | model_summary(model)
+        result = Result(came.result.mesh, model, numbers, {}, task, came, shapes, measured)
+        undrawn = _undrawn(result, failed)
+        # One list for all: what is told, the exit code, run.json and a cohort's table.
+        problems = _problems(result, failed)
+        result = result._replace(violated=sentences(problems))
+        tell(problems)
+        numbers |= {"violated": result.violated, "failed": failed}
         if job.json_path is not None:
             save_json(job.json_path, numbers)
-        if task.plan.pictures:
-            draw(task, came, model)
-        result = Result(came.result.mesh, model, numbers, {}, task, came, shapes, measured)
-        result = result._replace(violated=_judged(result, failed))
+        if undrawn is not None:
+            raise undrawn
         if came.is_kept:
             end_parts(job.output, came.result)
         return result
+
+
+def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
+    """Draw the pictures; return the error if that fails, which the numbers state, too, as they are written first."""
+    try:
+        if result.task.plan.pictures:
+            draw(result.task, result.meshed, result.model)
+    except Exception as error:
+        failed["figures"] = error_words(error)
+        return error
+    return None
 
 
 def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
@@ -141,21 +158,20 @@ def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
     return shapes.get("quality_initial"), shapes.get("quality")
 
 
-def _judged(result: Result, failed: dict[str, str]) -> dict[str, str]:
-    """Report and return violated requirements and failed measurements; warn of oddities."""
+def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
+    """Return violated requirements, failed measurements and oddities, worst first."""
     task, came, measured = result.task, result.meshed, result.measured
-    problems = tell_violated(came.result, measured, task.source.mask_word)
-    for name, reason in failed.items():
-        left = "the mesh's file has no cell means" if name == "fields" else "all other numbers are written"
-        problems[name] = f"{name} could not be measured: {reason}; {left}"
-        violated(problems[name])
+    problems = list(unmet(came.result.violated, measured, task.source.mask_word))
+    problems += failures(failed, problems)
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right anyway
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
-    warn_of_result(came.result, job.method, mode, n_nodes, expected, measured, spacing)
+    if job.cells_across is not None:
+        problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
+    problems += of_result(came.result, job.method, mode, n_nodes, expected, measured, spacing)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
-        warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
-    return problems
+        problems += of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
+    return agreed(problems)

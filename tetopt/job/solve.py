@@ -13,10 +13,11 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
-from tetopt.job.events import note, warning
+from tetopt.job.events import warning
 from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
 from tetopt.job.model import (
     check_model_options,
+    large_words,
     loads_of,
     model_of_file,
     with_chosen_sets,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 INTENSITY_MAPPING = "h"  # without a modulus, the image's intensities are the moduli, as in the paper
 PAPER_PERCENT = 1.0  # compression of the paper's test, only a scale for a linear law
-SMALL_FRACTION = 0.1  # of the mesh's length: larger displacements are not small, with strains of about 10 %
 
 
 class SolvedModel(NamedTuple):
@@ -181,14 +181,12 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
     """Warn if the order is unsuitable for the material, or the displacements are too large for the method."""
     if words := locking_words(model):
         warning(words)
-    size = float(np.ptp(model.mesh.points, axis=0).max())
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
-    if moved > SMALL_FRACTION * size:
-        note(
-            f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length, too "
-            "large for this linear solution; check loads and fixed sets, or write a file for CalculiX with "
-            "`nonlinear`"
-        )
+    how = (
+        "too large for this linear solution; check loads and fixed sets, or write a file for CalculiX with `nonlinear`"
+    )
+    if (large := large_words(model.mesh, moved, how)) is not None:
+        warning(large)
 
 
 def _numbers_of(solution: Solution) -> dict[str, Any]:

@@ -140,7 +140,7 @@ def numbers_of(
     summary["request"] = task.request
     if task.by_label is not None:
         made = task.by_label
-        rows = [row._asdict() for row in made.layers]
+        rows = [{"label": row.label, "thickness": row.thickness, "target": row.edge} for row in made.layers]
         summary["label_sizes"] = {"nodes": made.nodes, "scale": made.scale, "labels": rows}
     memory = {"peak_bytes": peak_bytes(), **came.predicted.get("memory", {})}
     return summary | {"memory": memory, "prediction": came.predicted["prediction"]}

@@ -101,6 +101,10 @@ class LabelFidelity(NamedTuple):
     thickness_voxels, thickness_mesh : Thickness, optional
         Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
         measured.
+    edge : float
+        Mean edge of the label's cells, mm: the median over its voxels in them; nan if not measured.
+    cells_across : float
+        Thickness of the label, up to ten voxels, over the mean edge of the cell there: the median over the same voxels.
 
     Examples
     --------
@@ -128,6 +132,8 @@ class LabelFidelity(NamedTuple):
     one_layer_fraction: float = np.nan
     thickness_voxels: Thickness | None = None
     thickness_mesh: Thickness | None = None
+    edge: float = np.nan
+    cells_across: float = np.nan
 
 
 class MaskFidelity(NamedTuple):

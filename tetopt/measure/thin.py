@@ -20,6 +20,7 @@ from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, loca
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
+from tetopt.geometry.simplex import squared_edges
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, labels_in_mask, surface_areas
@@ -177,6 +178,20 @@ def label_thickness(
     >>> f"{voxels.p50:.0f} mm of voxels, {cells.p50:.0f} mm of cells"
     '37 mm of voxels, 36 mm of cells'
     """
+    return {label: (row.voxels, row.cells) for label, row in label_layers(what, mesh, of_cell).items()}
+
+
+class Layers(NamedTuple):
+    """The thickness of a label, and of its cells at the voxels in them."""
+
+    voxels: Thickness | None  # of the smooth surface of its voxels
+    cells: Thickness | None  # of its cells
+    edge: float  # median of the mean edge of the cell, mm; nan without a voxel in its cells
+    across: float  # median of the voxels' thickness over that edge
+
+
+def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Layers]:
+    """Measure the local thickness of each label as `label_thickness` does, in mm and in edges of the cells there."""
     of_cell = checked_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
     if members is None:
@@ -185,7 +200,8 @@ def label_thickness(
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)
     rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
-    of_voxels = _percentiles(local_thickness(members, spacing, most, inside), rows, members.labels)
+    thick = local_thickness(members, spacing, most, inside)
+    of_voxels = _percentiles(thick, rows, members.labels)
     values, row = np.unique(of_cell, return_inverse=True)
     owner = cell_of_voxel(grid, mesh)
     rows = np.where(owner >= 0, row[owner], BEYOND_REGION)
@@ -193,7 +209,25 @@ def label_thickness(
     is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
     corners = (grid.to_index(mesh.points) * spacing)[shared.nodes[is_between]]
     of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values)
-    return {label: (of_voxels.get(label), of_cells.get(label)) for label in sorted(of_voxels | of_cells)}
+    is_right = (owner >= 0) & (members.labels[members.partition] == of_cell[owner])
+    is_right &= True if inside is None else inside
+    edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)[owner[is_right]]
+    label, across = of_cell[owner[is_right]], thick[is_right] / edge
+    edges, crossed = _medians(label, edge), _medians(label, across)
+    return {
+        number: Layers(
+            of_voxels.get(number), of_cells.get(number), edges.get(number, np.nan), crossed.get(number, np.nan)
+        )
+        for number in sorted(of_voxels | of_cells)
+    }
+
+
+def _medians(label: NDArray[np.int64], values: NDArray[np.floating]) -> dict[int, float]:
+    """Return the median of the values of each label."""
+    order = np.argsort(label, kind="stable")
+    numbers, starts = np.unique(label[order], return_index=True)
+    parts = np.split(values[order], starts[1:])
+    return {int(number): float(np.median(part)) for number, part in zip(numbers, parts, strict=True)}
 
 
 def _percentiles(

@@ -43,8 +43,7 @@ class Division(NamedTuple):
         number, most = self.n_parts or 1, max(nodes // FEWEST_NODES_EACH, 1)
         if number > most:
             raise InputError(
-                f"`parts`: expected at most {most} for {nodes} nodes ({FEWEST_NODES_EACH} each), got {number}; use "
-                "fewer"
+                f"`parts`: expected at most {most} for {nodes} nodes ({FEWEST_NODES_EACH} each), got {number}"
             )
         return number
 

@@ -23,7 +23,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import Quality, quality
-from tetopt.measure.thin import contact_totals, label_contacts, label_thickness
+from tetopt.measure.thin import contact_totals, label_contacts, label_layers
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
@@ -144,15 +144,15 @@ def fidelity(
 
         measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask)
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
-            measures["thickness"] = lambda: label_thickness(_with_levels(what, labels, mask), mesh, own())
+            measures["thickness"] = lambda: label_layers(_with_levels(what, labels, mask), mesh, own())
         measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
     measured = measured_each(measures, failed)
     thickness = measured.pop("thickness", {})
     if "labels" in measured:
-        columns = ("thickness_voxels", "thickness_mesh")
+        columns = ("thickness_voxels", "thickness_mesh", "edge", "cells_across")
         measured["labels"] = [
-            row._replace(**dict(zip(columns, thickness.get(row.label, (None, None)), strict=True)))
+            row._replace(**dict(zip(columns, thickness.get(row.label, row[-4:]), strict=True)))
             for row in measured["labels"]
         ]
     if "contacts" in measured:

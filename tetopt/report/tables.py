@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.curving import Curving
@@ -19,12 +20,14 @@ from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
 
 CHANGED_FRACTION = 0.2  # of a label's size: larger changes get a line of text
-WORST_ROWS = 5  # labels and pairs shown; run.json has all
+WORST_ROWS = 5  # thin labels and pairs shown; run.json has all
+WORST_LABELS = 12  # the same of labels
+LONGEST_NAME = 24  # of a label with its number, characters
 TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
 LARGE_SIZE = 1e4  # mm3 or mm2: larger labels are shown without decimals
 
 
-def new_table(*columns: str) -> Table:
+def new_table(*columns: str | Text) -> Table:
     """Create a table with these headers: names left-aligned, numbers right-aligned."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     for number, column in enumerate(columns):
@@ -58,30 +61,34 @@ def nodes_in_words(mesh: Mesh, order: int) -> str:
     return f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, order)} in all"
 
 
-def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None) -> None:
+def add_quality(
+    table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None, every: bool = False
+) -> None:
     """Add rows on the shape of one or more meshes, one column each; `in_all` are the numbers of nodes of quadratic
-    meshes, `jacobian` is the smallest scaled Jacobian determinant of curved cells."""
-    corners = [str(q.n_nodes) for q in meshes]
-    table.add_row("corner nodes" if in_all else "nodes", *corners)
-    if in_all:
-        table.add_row("nodes in all", *map(str, in_all))
+    meshes, `jacobian` is the smallest scaled Jacobian determinant of curved cells. `every` adds all measures of rho and
+    the kinds of bad cells."""
+    nodes = [str(q.n_nodes) for q in meshes]
+    nodes = [f"{whole} ({own} corners)" for whole, own in zip(in_all, nodes, strict=True)] if in_all else nodes
+    table.add_row("nodes", *nodes)
     rows: list[tuple[str, Callable[[Quality], str]]] = [
         ("cells", lambda q: str(q.n_cells)),
         (size_words(meshes[0].ndim), lambda q: size_text(q.volume, 2)),
         ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
-        ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
-        ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
-        ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
-        ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
-        ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
-        ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
         ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
         ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
-        ("edges, shortest, mm", lambda q: f"{q.min_edge:.4g}"),
-        ("edges, longest, mm", lambda q: f"{q.max_edge:.4g}"),
         ("cells below 10 degrees", lambda q: str(q.n_under_10_degrees)),
-        *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
+        ("edges, mm", lambda q: f"{q.min_edge:.4g} to {q.max_edge:.4g}"),
     ]
+    if every:
+        rows += [
+            ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
+            ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
+            ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
+            ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
+            ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
+            ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
+            *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
+        ]
     for name, text in rows:
         table.add_row(name, *(text(q) for q in meshes))
     if jacobian is not None:
@@ -128,28 +135,58 @@ def curving_in_words(curving: Curving) -> str:
     )
 
 
-def label_table(
-    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str], ndim: int
-) -> Table:
-    """Return a table of how well a mesh represents labels, and of the smoothness and topology of their surfaces.
+def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS) -> list[int]:
+    """Return the places of at most `most` labels, by default 12: those with the lowest Dice if there are more."""
+    places = list(range(len(rows)))
+    if most is None or len(rows) <= most:
+        return places
+    return sorted(sorted(places, key=lambda place: rows[place].dice)[:most])
 
-    Each label has a row, with its name if any. "larger by" compares its cells with its voxels.
+
+def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: int) -> Table:
+    """Return a table of how well a mesh represents labels.
+
+    Each label has a row, with its name if any. "larger by" compares its cells with its voxels; the distance is that of
+    their surfaces, and parts are connected components.
     """
-    table = new_table(
-        "label", "voxels", size_words(ndim), "cells", "larger by, %", "Dice", "Dice by volume", "distance, mm", "95 %",
-        "largest", "area ratio", "folded, %", "edges in > 2", "components of voxels", "of cells",
+    table = _table_of_labels(
+        "voxels", size_words(ndim).replace(" ", "\n"), "cells", "larger\nby, %", "Dice", "distance\n95 %, mm",
+        "parts of\nvoxels", "of\ncells",
     )  # fmt: skip
-    for row, surface in zip(rows, interfaces, strict=True):
+    for row in rows:
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
-        words = _label_words(row.label, names)
         size = size_text(row.volume, 1 if row.volume < LARGE_SIZE else 0)
-        apart = [size_text(mm, 3) for mm in (row.distance_mean, row.distance_p95, row.distance_max)]
         table.add_row(
-            words, str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
-            f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, _decimals(surface.area_ratio, 3),
-            _decimals(100.0 * surface.folded, 1), str(surface.nonmanifold_edges), str(row.components),
-            str(row.mesh_components),
+            _label_words(row.label, names), str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
+            f"{row.dice:.4f}", size_text(row.distance_p95, 3), str(row.components), str(row.mesh_components),
         )  # fmt: skip
+    return table
+
+
+def surface_table(
+    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
+) -> Table:
+    """Return a table of further measures of labels: Dice by volume, distances, smoothness and topology."""
+    table = _table_of_labels(
+        "Dice by\nvolume", "distance\nmean, mm", "largest,\nmm", "area\nratio", "folded,\n%", "edges in\n> 2 facets"
+    )
+    for row, surface in zip(rows, interfaces, strict=True):
+        table.add_row(
+            _label_words(row.label, names), f"{row.volume_dice:.4f}", size_text(row.distance_mean, 3),
+            size_text(row.distance_max, 3), _decimals(surface.area_ratio, 3), _decimals(100.0 * surface.folded, 1),
+            str(surface.nonmanifold_edges),
+        )  # fmt: skip
+    return table
+
+
+def _table_of_labels(*columns: str) -> Table:
+    """Create a table with a row for each label, whose long names are cut."""
+    table = new_table("label", *(Text(column) for column in columns))
+    table.columns[0].overflow, table.columns[0].no_wrap, table.columns[0].max_width = "ellipsis", True, LONGEST_NAME
+    for column in table.columns:
+        column.vertical = "bottom"
+    for column in table.columns[1:]:
+        column.no_wrap, column.overflow = True, "fold"  # a number is never cut
     return table
 
 
@@ -162,17 +199,19 @@ def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table
 
     Label 0 is not a tissue and is omitted.
     """
-    table = new_table(
-        "thin labels", "in one layer, %", "voxels, mm: 5 %", "50 %", "95 %", "cells, mm: 5 %", "50 %", "95 %"
+    table = _table_of_labels(
+        "in one\nlayer, %", "thickness of\nvoxels, mm", "of cells,\nmm", "edges,\nmm", "cells\nacross"
     )
+    table.columns[0].header = "thin labels"
     there = [row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL]
 
     def goodness(row: LabelFidelity) -> tuple[float, float, int]:
         return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label
 
     for row in sorted(there, key=goodness)[:WORST_ROWS]:
-        thickness = [text for each in (row.thickness_voxels, row.thickness_mesh) for text in _percentile_texts(each)]
-        table.add_row(_label_words(row.label, names), _decimals(100.0 * row.one_layer_fraction, 1), *thickness)
+        thick = [_percentiles_text(each) for each in (row.thickness_voxels, row.thickness_mesh)]
+        layer, edges = _decimals(100.0 * row.one_layer_fraction, 1), size_text(row.edge, 2)
+        table.add_row(_label_words(row.label, names), layer, *thick, edges, _decimals(row.cells_across, 1))
     return table
 
 
@@ -199,8 +238,12 @@ def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
     )
 
 
-def _percentile_texts(thickness: Thickness | None) -> list[str]:
-    return ["-"] * 3 if thickness is None else [size_text(mm, 2) for mm in thickness]
+def _percentiles_text(thickness: Thickness | None) -> str:
+    """Return the median, and in brackets the 5th and 95th percentile."""
+    if thickness is None:
+        return "-"
+    low, middle, high = (size_text(mm, 2) for mm in thickness)
+    return f"{middle} ({low} to {high})"
 
 
 def _label_words(label: int, names: Mapping[int, str]) -> str:
@@ -211,7 +254,7 @@ def label_differences(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> list[str]:
     """Describe labels whose cells differ from their voxels in topology, or strongly in size: one line per label."""
-    lines = []
+    lines: list[str] = []
     for row, surface in zip(rows, interfaces, strict=True):
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = row.components + cavities - surface.euler // 2

@@ -23,7 +23,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.budget import check_memory
+from tetopt.system.budget import at_most, check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
 KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first
@@ -108,7 +108,8 @@ def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[
             f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; use fewer blocks"
         )
     n_nodes = _node_count(kind, blocks)
-    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "use fewer nodes")
+    need = LATTICE_NODE_BYTES * n_nodes
+    check_memory(need, f"lattice: {n_nodes} nodes", lambda room: at_most(room / LATTICE_NODE_BYTES, "nodes"))
     return blocks
 
 

@@ -40,7 +40,7 @@ from tetopt.start.sizes import (
     equilateral_nodes,
 )
 from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
-from tetopt.system.budget import check_memory
+from tetopt.system.budget import at_most, check_memory
 
 # Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks first.
 ROOT_FRACTIONS = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
@@ -190,10 +190,11 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
-    if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
+    if nodes > (most := max(prod(image.shape), ALWAYS_ALLOWED_NODES)):
         shape = " x ".join(map(str, image.shape))
-        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; use fewer")
-    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "use fewer")
+        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; use at most {most}")
+    need = OCTREE_NODE_BYTES * nodes
+    check_memory(need, f"octree: {nodes} nodes", lambda room: at_most(room / OCTREE_NODE_BYTES))
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:

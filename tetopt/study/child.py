@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.job.events import note
 from tetopt.mesh import Mesh
-from tetopt.study.endings import Crashed, NotInstalled, last_line
+from tetopt.study.endings import AFTER_CRASHES, Crashed, NotInstalled, last_line
 from tetopt.study.pipelines import PipelineInput, Produced
 from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
 from tetopt.system.interpreter import python_command, python_environment
 
+SMOOTHING_FACTOR = 2.0  # `smoothing` of the run that follows a crash
 Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": not installed
 
 
@@ -55,8 +56,8 @@ def run_in_child(
 ) -> Outcome:
     """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
 
-    A run ended by a foreign signal (a crash, or the system short of memory) is repeated once, as fTetWild crashes at
-    random.
+    A run ended by a foreign signal (a crash, or the system short of memory) is repeated once, with smoother surfaces,
+    as fTetWild crashes at random and on rough ones.
 
     Parameters
     ----------
@@ -88,12 +89,14 @@ def run_in_child(
     if first.reason != "crash":
         return first
     crash = first.failure or ""
-    note(f"{title}: {crash}; running it again")
-    again = _run_once(pipeline, job, max_seconds, max_bytes)
+    note(f"{title}: {crash}; running it again, with smoother surfaces")
+    again = _run_once(pipeline, job._replace(smoothing=SMOOTHING_FACTOR), max_seconds, max_bytes)
     again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes), crashes=(*first.crashes, *again.crashes))
     if again.failure is None:
-        return again._replace(notes=[f"the first run {crash}; this is the second", *again.notes])
-    return again._replace(failure=f"twice {crash}" if again.failure == crash else f"{crash}; then {again.failure}")
+        words = f"the first run {crash}; this is the second, with surfaces {SMOOTHING_FACTOR:g} times as smooth"
+        return again._replace(notes=[words, *again.notes])
+    failure = f"twice {crash}" if again.failure == crash else f"{crash}; then {again.failure}"
+    return again._replace(failure=f"{failure}; {AFTER_CRASHES}" if again.reason == "crash" else failure)
 
 
 def _run_once(

@@ -33,7 +33,7 @@ from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
-from tetopt.job.events import note
+from tetopt.job.events import note, warning
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
@@ -315,6 +315,10 @@ def _run(
 ) -> tuple[Report, dict[int, dict[str, Mesh]]]:
     """Run the comparison, with the work directory of its runs."""
     begin = time.perf_counter()
+    known = pipelines_with(comparison.settings.programs)
+    for name in comparison.settings.pipelines:  # before the hours that the others may take
+        if (words := known[name].missing) is not None:
+            warning(words)
     facts = _facts(comparison)
     comparison = _settled(comparison, facts, runs, resume=resume)
     image, settings = comparison.image, comparison.settings

@@ -24,6 +24,7 @@ from tetopt.study.compare_criteria import (
     winners,
 )
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, PipelineResult, Report
+from tetopt.study.endings import AFTER_CRASHES
 
 SIZE_TOLERANCE = 1.1  # a larger factor between numbers of nodes is remarked
 
@@ -179,7 +180,9 @@ def failure_words(each: PipelineResult) -> str:
     if each.reason == "missing":
         return f"{each.title} is not installed"
     is_crash = each.reason == "crash"  # and was run again
-    how = (each.failure or "no run").removeprefix("twice ").removeprefix("crashed: ") if is_crash else each.failure
+    how = each.failure
+    if is_crash:
+        how = (how or "no run").removeprefix("twice ").removeprefix("crashed: ").removesuffix(f"; {AFTER_CRASHES}")
     return f"{each.title} failed{' twice' if is_crash else ''} ({how})"
 
 

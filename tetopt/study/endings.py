@@ -5,6 +5,7 @@ from __future__ import annotations
 from tetopt.errors import InputError
 from tetopt.io.text import plain
 
+AFTER_CRASHES = "try another number of classes or nodes, or your own labels"
 LINE_CHARACTERS = 300  # of another program's line in a message, at most
 
 

@@ -39,7 +39,9 @@ class Surfaces(NamedTuple):
     notes: list[str]  # dropped parts
 
 
-def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels: Image | None = None) -> Surfaces:
+def interfaces(
+    image: Image, size: float, *, classes: int = OTSU_CLASSES, labels: Image | None = None, smoothing: float = 1.0
+) -> Surfaces:
     """Extract all interfaces between the classes of an image, or between given labels, and the box around them.
 
     Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the thresholds of the
@@ -57,6 +59,8 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
         Number of classes without labels, 2 or more.
     labels : Image, optional
         Whole numbers, on the image's voxels.
+    smoothing : float
+        Factor on the Gaussian's width, and on the shortest wavelength that the windowed sinc keeps.
 
     Returns
     -------
@@ -70,9 +74,9 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
     """
     _check(image, size, labels)
     if labels is None:
-        pieces, notes = _isosurfaces(image, size, classes)
+        pieces, notes = _isosurfaces(image, size, classes, smoothing)
     else:
-        pieces, notes = _label_surface(labels.data, image.spacing, size)
+        pieces, notes = _label_surface(labels.data, image.spacing, size, smoothing)
     low, high = box_sides(image.shape).T * image.spacing
     cut = [_cut_by_box(_decimated(piece, size), low, high) for piece in pieces]
     soup = [(points, triangles) for points, triangles in cut if len(triangles)]
@@ -94,9 +98,9 @@ def class_labels(image: Image, classes: int) -> Image:
     return Image(np.digitize(smooth, thresholds), image.affine)
 
 
-def _classes(image: Image, classes: int) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+def _classes(image: Image, classes: int, smoothing: float = 1.0) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Return the smoothed volume and the thresholds between its classes."""
-    smooth = gaussian_filter(image.data, SIGMA_VOXELS, mode="nearest")
+    smooth = gaussian_filter(image.data, smoothing * SIGMA_VOXELS, mode="nearest")
     return smooth, class_thresholds(smooth.ravel(), classes)
 
 
@@ -113,8 +117,8 @@ def _check(image: Image, size: float, labels: Image | None) -> None:
         raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
 
 
-def _isosurfaces(image: Image, size: float, classes: int) -> tuple[list[pyvista.PolyData], list[str]]:
-    smooth, thresholds = _classes(image, classes)
+def _isosurfaces(image: Image, size: float, classes: int, smoothing: float) -> tuple[list[pyvista.PolyData], list[str]]:
+    smooth, thresholds = _classes(image, classes, smoothing)
     grid = _padded_grid(smooth, image.spacing, size)
     pieces, notes = [], []
     for threshold in thresholds:
@@ -125,12 +129,12 @@ def _isosurfaces(image: Image, size: float, classes: int) -> tuple[list[pyvista.
         if large.n_cells == 0:
             notes.append(f"threshold {threshold:.4g}: dropped the whole surface, as every piece is a speck")
             continue
-        pieces.append(_smoothed(large))
+        pieces.append(_smoothed(large, smoothing))
     return pieces, notes
 
 
 def _label_surface(
-    data: NDArray[np.floating], spacing: NDArray[np.float64], size: float
+    data: NDArray[np.floating], spacing: NDArray[np.float64], size: float, smoothing: float
 ) -> tuple[list[pyvista.PolyData], list[str]]:
     values, numbered = np.unique(data, return_inverse=True)
     if len(values) == 1:
@@ -146,7 +150,7 @@ def _label_surface(
     lost = [f"{value:g}" for number, value in enumerate(values, 1) if number not in seen]
     if lost and n_dropped:
         notes.append(f"lost labels, as every piece of their surface is a speck: {', '.join(lost)}")
-    return ([_smoothed(large)] if large.n_cells else []), notes
+    return ([_smoothed(large, smoothing)] if large.n_cells else []), notes
 
 
 def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
@@ -175,9 +179,9 @@ def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.Pol
     return large, int((~is_large).sum())
 
 
-def _smoothed(surface: pyvista.PolyData) -> pyvista.PolyData:
+def _smoothed(surface: pyvista.PolyData, smoothing: float) -> pyvista.PolyData:
     return surface.smooth_taubin(
-        n_iter=SINC_ITERATIONS, pass_band=PASS_BAND, boundary_smoothing=False, non_manifold_smoothing=True
+        n_iter=SINC_ITERATIONS, pass_band=PASS_BAND / smoothing, boundary_smoothing=False, non_manifold_smoothing=True
     )
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,11 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.cleaver import stuffed
+from tetopt.study.cleaver import INSTALL_HINT, stuffed
 from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
+from tetopt.system.extras import install_hint
 
 LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
 
@@ -37,6 +39,7 @@ class PipelineInput(NamedTuple):
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
     iterations: int = UNIFORM_ITERATIONS  # of uniform meshes
     order: int = 1  # of the cells whose nodes are counted: order 2 has mid-edge nodes
+    smoothing: float = 1.0  # of the surfaces that a peer fills: larger where it crashed
 
 
 class Produced(NamedTuple):
@@ -135,7 +138,7 @@ def pytetwild(job: PipelineInput) -> Produced:
     seconds: dict[str, float] = {}
     size = node_spacing(job.image, corners_for(job.nodes, job.order))
     with _timed(seconds, "surfaces"):
-        surfaces = interfaces(job.image, size, classes=job.classes, labels=job.labels)
+        surfaces = interfaces(job.image, size, classes=job.classes, labels=job.labels, smoothing=job.smoothing)
     with _timed(seconds, "tetrahedra"):
         result = filled(job.image, surfaces, job.nodes, job.order)
     return _searched(result, seconds, surfaces.notes)
@@ -172,6 +175,14 @@ class Pipeline(NamedTuple):
     about: str
     function: Callable[[PipelineInput], Produced]
     is_random: bool = False
+    packages: tuple[str, ...] = ()  # that it needs
+    hint: str = ""  # how to install them
+
+    @property
+    def missing(self) -> str | None:
+        """How to install what the pipeline needs and this machine lacks, in words."""
+        is_there = all(find_spec(package.partition(".")[0]) and find_spec(package) for package in self.packages)
+        return None if is_there else f"{self.title}: not installed; {self.hint}"
 
 
 PIPELINES = {
@@ -189,9 +200,12 @@ PIPELINES = {
     ),
     "pytetwild": Pipeline(
         "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
-        pytetwild, is_random=True,
+        pytetwild, is_random=True, packages=("pytetwild",),
+        hint=f"install it with: {install_hint('compare', 'pytetwild')}",
     ),
-    "cleaver": Pipeline("itk-cleaver", "peer", "the same labels, Cleaver", cleaver),
+    "cleaver": Pipeline(
+        "itk-cleaver", "peer", "the same labels, Cleaver", cleaver, packages=("itk.CleaverPython",), hint=INSTALL_HINT
+    ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
     "odt": Pipeline(
         "ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0",

@@ -10,6 +10,8 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Callable
+from math import floor, inf, log10
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +35,13 @@ def memory_words(n_bytes: float) -> str:
     return f"{n_bytes / BYTES_PER_GB:.3g} GB" if n_bytes >= 1e8 else f"{n_bytes / 1e6:.3g} MB"
 
 
-def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = None) -> None:
+def at_most(count: float, noun: str = "") -> str:
+    """Advise a number that is within a limit, rounded down to two digits: "use at most 120000 nodes"."""
+    step = 10 ** max(floor(log10(max(count, 1.0))) - 1, 0)
+    return f"use at most {max(floor(count / step), 0) * step} {noun}".rstrip()
+
+
+def check_memory(n_bytes: float, what: str, advice: str | Callable[[float], str], limit: float | None = None) -> None:
     """Raise InputError if the next step needs more memory than is available, or than `limit`, bytes.
 
     Parameters
@@ -42,20 +50,21 @@ def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = N
         Memory that the step needs in addition to what this process has.
     what : str
         The step with its sizes; begins the message.
-    advice : str
-        The remedy; ends the message.
+    advice : str or callable
+        The remedy; ends the message. A function returns it for the bytes that the step may take.
     limit : float, optional
         The user's limit on the total memory of this process.
     """
-    free = available_bytes()
+    free, room = available_bytes(), inf if limit is None else limit - resident_bytes()
+    remedy = advice(min(free, room)) if callable(advice) else advice
     if n_bytes > free:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes)} of memory, but only {memory_words(free)} is free; {advice}"
+            f"{what}: needs about {memory_words(n_bytes)} of memory, but only {memory_words(free)} is free; {remedy}"
         )
-    if limit is not None and n_bytes + resident_bytes() > limit:
+    if limit is not None and n_bytes > room:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in total, but "
-            f"only {memory_words(limit)} is allowed; {advice}"
+            f"{what}: needs about {memory_words(n_bytes + limit - room)} of memory in total, but "
+            f"only {memory_words(limit)} is allowed; {remedy}"
         )
 
 

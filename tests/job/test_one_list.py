@@ -1,0 +1,129 @@
+"""What is wrong with a mesh is one list: the command's exit code, run.json, its last line, and a cohort's row agree."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+from scipy.ndimage import gaussian_filter
+
+import tetopt
+import tetopt.report.summary
+from tetopt.cohort.flags import flags_of
+from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
+from tetopt.cohort.numbers import row_of
+from tetopt.cohort.state import state_of
+from tetopt.job.advice import Problem, agreed, of_layers, sentences
+from tetopt.measure.fidelity import LabelFidelity
+
+COARSE = ["--spacing", "12", "--iterations", "0"]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """An image, and labels of which one has 512 voxels that are apart, which large cells cannot have."""
+    folder = tmp_path_factory.mktemp("inputs")
+    x = np.indices((24, 24, 24))[0]
+    labels = np.where(x < 12, 1, 3)
+    labels[::3, ::3, ::3] = 2
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels))
+    tetopt.save_image(folder / "a.nii.gz", tetopt.Image(10.0 * labels + x % 5))
+    return folder
+
+
+def failing(*_):
+    raise ZeroDivisionError("no way")
+
+
+CASES = {
+    "labels": (["--labels", "l.nii.gz", *COARSE, "--smooth-interfaces", "0"], None),  # lost
+    "contacts": (["--labels", "l.nii.gz", *COARSE], "label_contacts"),  # a measurement that fails
+    "error": (["--target-error", "1e-4", "--size-min", "20", "--iterations", "1"], None),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_exit_code_and_files_and_cohort_agree(inputs, tmp_path, monkeypatch, capsys, name):
+    words, measure = CASES[name]
+    monkeypatch.chdir(inputs)
+    if measure is not None:
+        monkeypatch.setattr(tetopt.report.summary, measure, failing)
+    key = "sub-1"
+    subject_folder(tmp_path, key).mkdir(parents=True)
+    mesh, numbers = subject_folder(tmp_path, key) / mesh_name(key, ".vtu"), numbers_path(tmp_path, key)
+    assert exit_code("mesh", "a.nii.gz", "-o", mesh, "--json", numbers, *words) == 1
+    violated = numbers_in(numbers)["violated"]
+    assert name in violated
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1].startswith(f"requirements not met: {', '.join(violated)}; {mesh}: ")
+    for key_of, sentence in violated.items():
+        assert sentence.replace("`", "")[:40].split(";")[0] in said.err.replace("`", ""), key_of
+    row = row_of(tmp_path, key)
+    assert (row.status, row.violated) == ("violated", tuple(violated))
+    assert state_of(tmp_path, key, ".vtu", None).status == "violated"
+    (flags,) = flags_of([row])
+    assert {flag.column for flag in flags} <= {"violated", "label"}
+    assert len(flags) >= 1
+
+
+def test_a_good_mesh_ends_with_a_verdict(inputs, tmp_path, capsys):
+    out = tmp_path / "a.vtu"
+    command = ["mesh", inputs / "a.nii.gz", "-o", out, "--json", tmp_path / "a.json", "--spacing", "8"]
+    assert exit_code(*command, "--iterations", "0") == 0
+    assert numbers_in(tmp_path / "a.json")["violated"] == {}
+    said = capsys.readouterr()
+    size = numbers_in(tmp_path / "a.json")["size"]
+    words = f"all requirements are met; {out}: {size['n_nodes']} nodes, {size['n_cells']} cells"
+    assert said.out.splitlines()[-1] == words
+    assert "warning" not in said.err
+    assert exit_code("quality", out, "--image", inputs / "a.nii.gz", "--check") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == words
+
+
+def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypatch, capsys):
+    """The run fails, but its numbers are there, and name the failure, too."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "slice.png")
+
+    monkeypatch.setattr(tetopt.job.run, "draw", full)
+    command = ["mesh", inputs / "a.nii.gz", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", *COARSE]
+    assert exit_code(*command, "--figures", tmp_path) == 2
+    numbers = numbers_in(tmp_path / "a.json")
+    assert list(numbers["violated"]) == list(numbers["failed"]) == ["figures"]
+    assert "slice.png: No space left" in capsys.readouterr().err.splitlines()[-2]
+
+
+def test_remedies_agree():
+    """The worst decides: what it asks for is not contradicted by what follows."""
+    more, fewer = Problem("a", "allow more nodes", wants="smaller"), Problem("b", "reduce `nodes`", wants="larger")
+    lost = Problem("c", "allow more nodes", "labels", "smaller")
+    assert [each.words for each in agreed([more, fewer])] == ["a; allow more nodes", "b"]
+    assert [each.words for each in agreed([fewer, more])] == ["b; reduce `nodes`", "a"]
+    assert [each.words for each in agreed([fewer, Problem("d"), lost])] == ["c; allow more nodes", "b", "d"]
+    assert sentences([lost, more, lost._replace(text="e")]) == {"labels": "c; allow more nodes; e; allow more nodes"}
+
+
+def test_cells_across_are_those_of_the_mesh():
+    row = LabelFidelity(3, 900, 900.0, 900.0, 90, 0, 0.9, 0.9, 0.1, 0.2, 1, 1, False, edge=3.6, cells_across=1.2)
+    rows = [row, row._replace(label=4, cells_across=1.9), row._replace(label=5, cells_across=0.8, edge=5.0)]
+    (problem,) = of_layers([*rows, row._replace(label=0)], 2.0, {3: "fluid"})
+    assert problem.text == "fewer than 2 cells across: 5 0.8 (edges 5 mm), 3 (fluid) 1.2 (edges 3.6 mm)"
+    assert list(of_layers(rows[1:2], 2.0, {})) == []
+
+
+@pytest.mark.full
+def test_flat_cells_are_judged_without_iterations(tmp_path, capsys):
+    """By the run and by `quality --check`, within a mask whose surface cuts the lattice."""
+    mask = gaussian_filter(np.random.default_rng(1).normal(size=(24, 24, 24)), 2.0) > 0.0
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.Image(np.indices(mask.shape)[0] + 20.0))
+    tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(1.0 * mask))
+    out, numbers = tmp_path / "a.vtu", tmp_path / "a.json"
+    words = ["mesh", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz", "-o", out, "--json", numbers]
+    assert exit_code(*words, "--nodes", "1200", "--iterations", "0") == 1
+    assert numbers_in(numbers)["quality"]["min_dihedral"] < 12.0
+    assert list(numbers_in(numbers)["violated"]) == ["min_dihedral"]
+    again = ["quality", out, "--image", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz", "--check"]
+    assert exit_code(*again, "--json", tmp_path / "q.json") == 1
+    assert list(json.loads((tmp_path / "q.json").read_text())["violated"]) == ["min_dihedral"]
+    assert "--iterations" in capsys.readouterr().err

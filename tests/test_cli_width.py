@@ -1,0 +1,87 @@
+"""Lines as users see them: none wider than 100 columns, in a pipe or a wide terminal; long tables end in a count."""
+
+import numpy as np
+import pytest
+from commands import exit_code
+from models import sample_image
+
+import tetopt
+import tetopt.cli.console as console
+from tetopt.measure.fidelity import LabelFidelity, Thickness
+from tetopt.measure.interfaces import LabelInterface
+
+N_LABELS = 300
+
+
+@pytest.fixture(autouse=True)
+def real_width(monkeypatch, wide_lines):
+    monkeypatch.setattr(console, "LINE_WIDTH", 100)
+
+
+@pytest.fixture
+def labels():
+    thick = Thickness(101.25, 1234.5, 12345.6)
+    rows = [
+        LabelFidelity(
+            100000 + k, 12345678, 1234567.89, 1234567.89, 123456, 0, 1.0 - 0.001 * k, 0.9, 123.456, 123.456, 12, 11,
+            False, 123.4, 0.5, thick, thick, 12.34, 12.34,
+        )
+        for k in range(N_LABELS)
+    ]  # fmt: skip
+    names = {row.label: f"left superior temporal gyrus, part {row.label}" for row in rows}
+    number = {name: 1.0 if name.endswith("o") or name == "folded" else 7 for name in LabelInterface._fields}
+    interfaces = [LabelInterface(**{**number, "label": row.label}) for row in rows]
+    return {"labels": rows, "interfaces": interfaces, "label_names": names}
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_tables_of_hundreds_of_labels(labels, capsys, every):
+    console.print_fidelity(labels, 3, every=every)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 100
+    table = lines[: next(k for k, line in enumerate(lines) if "area" in line or "thickness of" in line)]
+    shown = [line for line in table if " left superior" in line]
+    assert all("12345678" in line for line in shown)  # numbers are whole
+    if every:
+        assert len(shown) == N_LABELS
+    else:
+        assert len(shown) == 12
+        assert shown[-1].startswith(f"{100000 + N_LABELS - 1} left")  # the worst
+        assert any("12 of 300 labels with the lowest Dice" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def mesh(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    tetopt.save_image(folder / "a.nii.gz", sample_image(3))
+    return folder
+
+
+def test_a_run_prints_ten_rows_and_quality_all_of_them(mesh, monkeypatch, capsys):
+    monkeypatch.chdir(mesh)
+    assert exit_code("mesh", "a.nii.gz", "-o", "a.vtu", "--spacing", "6", "--iterations", "0", "--force") == 0
+    said = capsys.readouterr()
+    lines = said.out.splitlines()
+    table = lines[1 : next(k for k, line in enumerate(lines) if line.startswith("all requirements"))]
+    assert 8 <= len(table) <= 10
+    assert not [line for line in table if "error (" in line or "bad cells" in line]
+    assert max(map(len, [*lines, *said.err.splitlines()])) <= 100
+    assert exit_code("quality", "a.vtu", "--image", "a.nii.gz") == 0
+    assert "rho error (iv), worst" not in capsys.readouterr().out
+    assert exit_code("quality", "a.vtu", "--image", "a.nii.gz", "--all") == 0
+    out = capsys.readouterr().out
+    assert "rho error (iv), worst" in out
+    assert "bad cells: slivers" in out
+
+
+def test_messages_wrap_between_words_and_errors_stay_on_a_line(capsys):
+    path = "/long/" + 12 * "directory/" + "a.nii.gz"
+    console.show_warning(f"{path}: " + 30 * "word ")
+    warning = capsys.readouterr().err.splitlines()
+    assert len(warning) > 2
+    assert all(len(line) <= 100 or path in line for line in warning)
+    assert all(line.startswith("  ") for line in warning[1:])
+    console.show_error(f"{path}: " + 30 * "word ")
+    assert capsys.readouterr().err.count("\n") == 1  # for programs
+    console.print_line(20 * "seven, ")
+    assert np.max([len(line) for line in capsys.readouterr().out.splitlines()]) <= 100
