@@ -74,9 +74,10 @@ def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | Non
     handles = []
     if labels is not None:
         view = view_of(part, of_cell[chosen].astype(np.float64), "label of each cell")
-        colours = label_colours(labels)
+        numbers = np.arange(int(labels.data.max()) + 1)
+        colours = label_colours(numbers)
         pictures.append((view.title, photograph(labelled_cutaway(view, colours))))
-        handles = legend_patches(colours, np.bincount(view.values.astype(np.int64)))
+        handles = legend_patches(numbers, colours, np.bincount(view.values.astype(np.int64), minlength=len(numbers)))
     height, width = pictures[0][1].shape[:2]
     figure = Figure(figsize=(5.6 * len(pictures) + bool(handles), 5.6 * height / width + 0.4), layout="constrained")
     for axes, (title, pixels) in zip(figure.subplots(1, len(pictures), squeeze=False)[0], pictures, strict=True):

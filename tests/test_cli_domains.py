@@ -429,3 +429,39 @@ def test_label_zero_within_a_mask_has_a_row(tmp_path, monkeypatch, capsys):
     numbers = [row["mesh_cavities"] for row in numbers_in(tmp_path / "a.json")["interfaces"]]
     assert numbers == [0, 1]
     capsys.readouterr()
+
+
+def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
+    """Tables count the file's own voxels, one of a label 2^31 - 1 in a sheet as thin as they are."""
+    fine = tetopt.Image(np.zeros((24, 24, 24)), np.diag([1.0, 1.0, 1.0, 1.0]))
+    labels = np.where(distance(fine.shape, 12, 12, 12) < 9, 5.0, 0.0)
+    labels[12, 6:18, 6:18] = 2.0**31 - 1
+    coarse = np.diag([2.0, 2.0, 2.0, 1.0])
+    coarse[:3, 3] = 0.5
+    rng = np.random.default_rng(0)
+    tetopt.save_image(tmp_path / "i.nii.gz", tetopt.Image(rng.normal(size=(12, 12, 12)), coarse))
+    tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels))
+    tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(labels > 0))
+    tetopt.save_image(tmp_path / "two.nii.gz", tetopt.Image(rng.normal(size=(12, 12, 12)), coarse))
+    files = ["--labels", tmp_path / "l.nii.gz", "--mask", tmp_path / "m.nii.gz"]
+    words = ["mesh", tmp_path / "i.nii.gz", tmp_path / "two.nii.gz", *files, "--nodes", "1500", "--iterations", "1"]
+    assert exit_code(*words, "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json") in (0, 1)
+    numbers = numbers_in(tmp_path / "a.json")
+    assert numbers["inputs"]["divided"] == [2, 2, 2]
+    counts = {row["label"]: row["voxels"] for row in numbers["labels"]}
+    assert counts == {label: np.count_nonzero(labels == label) for label in (5, 2**31 - 1)}
+    assert numbers["mask"]["voxels"] == np.count_nonzero(labels)
+    mesh = tetopt.load_mesh(tmp_path / "a.vtu")
+    assert np.unique(mesh.cell_data["label"]).tolist() == [5, 2**31 - 1]
+    assert "label_2147483647" in mesh.sets.cells
+    words = ["quality", tmp_path / "a.vtu", "--image", tmp_path / "i.nii.gz", *files, "--json", tmp_path / "q.json"]
+    assert exit_code(*words) == 0
+    again = numbers_in(tmp_path / "q.json")
+    assert {row["label"]: row["voxels"] for row in again["labels"]} == counts
+    flat = ["mesh", tmp_path / "i.nii.gz", "--labels", tmp_path / "l.nii.gz", "--slice", "k=6", "--crop", "2:10,:,:"]
+    assert exit_code(
+        *flat, "-o", tmp_path / "s.vtu", "--nodes", "200", "--iterations", "0", "--json", tmp_path / "s.json"
+    ) in (0, 1)
+    counted = {row["label"]: row["voxels"] for row in numbers_in(tmp_path / "s.json")["labels"]}
+    plane = labels[4:20, :, 13]  # the nearest above the middle of two
+    assert counted == {label: np.count_nonzero(plane == label) for label in (0, 5, 2**31 - 1)}

@@ -1,12 +1,22 @@
 """Masks, labels and contrasts land on the image's voxels by the affines; the foreground is what it should be."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
+import scipy
 
 import tetopt
-from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
+from tetopt.contents.align import (
+    background_level,
+    divided,
+    divisions,
+    foreground_mask,
+    resample_contrast,
+    resample_labels,
+    resample_mask,
+)
 
 SHAPE, OTHER = (7, 9, 6), (8, 6, 7)
 
@@ -225,8 +235,10 @@ def test_labels_that_are_none():
     assert said(labels[0]) == (
         "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
     )
-    for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 32_768, "32768")):
-        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767; .* the first {value} at", said(bad))
+    for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 2**31, "2147483648")):
+        assert re.match(
+            rf"l\.nrrd: labels must be whole numbers from 0 to 2147483647; .* the first {value} at", said(bad)
+        )
     assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
     assert said(labels, _translation(0, 3, 0)) == (
         "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
@@ -370,3 +382,69 @@ def test_a_large_bright_piece_is_not_removed_silently():
     data[ball(data.shape, 5, (54, 6, 6))] = 1.0
     with pytest.warns(UserWarning, match=r"bright ones are removed: 1, 515 mm3 in all, the largest 515 mm3"):
         assert foreground_mask(tetopt.Image(data), 0.0).data[54, 6, 6] == 0
+
+
+def shell(n, spacing, shift=0.0):
+    """A ball of 3 in a closed shell of 0.7 mm, 2, in a ball of 1, on n^3 voxels around the origin."""
+    affine = np.diag([spacing] * 3 + [1.0])
+    affine[:3, 3] = -0.5 * spacing * (n - 1) + shift
+    labels = tetopt.Image(np.zeros((n,) * 3), affine)
+    r = np.linalg.norm(labels.to_world(np.moveaxis(np.indices(labels.shape), 0, -1)), axis=-1)
+    return tetopt.Image(np.where(r < 4.3, 3, np.where(r < 5, 2, np.where(r < 8, 1, 0))), affine)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.25, 0.1])
+def test_voxels_divided_to_the_size_of_labels_keep_all_of_them(shift):
+    """The shell stays closed: what it encloses is apart from what is around it, voxel by voxel."""
+    labels, image = shell(40, 0.5, shift), tetopt.Image(np.zeros((10,) * 3), np.diag([2.0, 2.0, 2.0, 1.0]))
+    image = tetopt.Image(image.data, image.affine @ _translation(-4.5, -4.5, -4.5))
+    assert divisions(image, [labels]) == (4, 4, 4)
+    moved = resample_labels(labels, divided(image, (4, 4, 4)), "l")
+    for label in (0, 1, 2, 3):
+        counts = [scipy.ndimage.label(each.data == label)[1] for each in (labels, moved)]
+        assert counts == [1, 1]
+    n_lost = [np.count_nonzero(moved.data == label) / np.count_nonzero(labels.data == label) for label in (1, 2, 3)]
+    np.testing.assert_allclose(n_lost, 1.0)
+    with pytest.warns(UserWarning, match=r"0.5 x 0.5 x 0.5 mm to 2 x 2 x 2 mm; label \d (loses \d+%|falls into \d+ p)"):
+        resample_labels(labels, image, "l")
+
+
+def test_voxels_are_divided_only_where_others_are_finer():
+    image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([1.0, 1.0, 5.0, 1.0]))
+    other = partial(tetopt.Image, np.zeros((8, 8, 8)))
+    assert divisions(image, [other(np.diag([2.0, 1.0005, 1.0, 1.0]))]) == (1, 1, 5)
+    assert divisions(image, [other(np.diag([1.0, 0.98, 5.0, 1.0])), other(np.eye(4))]) == (1, 2, 5)
+    turned = np.eye(4)[[2, 0, 1, 3]] @ np.diag([1.0, 0.5, 0.25, 1.0])
+    assert divisions(image, [other(turned)]) == (4, 1, 10)
+    data = np.arange(120.0).reshape(4, 5, 6)
+    parts = divided(tetopt.Image(data, image.affine), (1, 2, 5))
+    assert parts.volume == pytest.approx(image.volume)
+    for place in ((0, 0, 0), (3, 4, 5), (1, 2, 3)):
+        i, j, k = place
+        np.testing.assert_array_equal(parts.data[i, 2 * j : 2 * j + 2, 5 * k : 5 * k + 5], data[place])
+    np.testing.assert_allclose(parts.to_world([1, 4.5, 17.0]), image.to_world([1, 2, 3]))
+
+
+def test_values_near_whole_numbers_are_rounded():
+    image = tetopt.Image(np.zeros((4, 3, 2)))
+    labels = np.arange(24).reshape(4, 3, 2) % 5
+    with pytest.warns(UserWarning, match=r"l: 19 voxels were rounded to whole numbers \(by up to 0.00061\)"):
+        moved = resample_labels(tetopt.Image(labels * 1.000152), image, "l")
+    np.testing.assert_array_equal(moved.data, labels)
+    assert "the first 0.002 at (0, 0, 0)" in message(resample_labels, "l", tetopt.Image(labels + 0.002), image)
+    assert resample_labels(tetopt.Image(labels * (2**31 - 1) // 4), image, "l").data.max() == 2**31 - 1
+
+
+@pytest.mark.parametrize("levels", [None, 32, 100])
+def test_a_grey_image_is_no_label_image(levels):
+    rng = np.random.default_rng(0)
+    grey = scipy.ndimage.gaussian_filter(rng.normal(size=(24, 24, 24)), 4.0)
+    grey = np.rint((grey - grey.min()) / np.ptp(grey) * (levels or 4000)) + 1
+    image, words = (
+        tetopt.Image(np.zeros((24, 24, 24))),
+        r"l.*: expected a label image, got \d+ values, .* a label",
+    )
+    assert re.match(words, message(resample_labels, "l", tetopt.Image(grey), image))
+    assert re.match(words, message(tetopt.content, image, tetopt.Image(grey)))
+    cubes = rng.permutation(512).reshape(8, 8, 8).repeat(3, 0).repeat(3, 1).repeat(3, 2)
+    np.testing.assert_array_equal(resample_labels(tetopt.Image(cubes), image, "l").data, cubes)

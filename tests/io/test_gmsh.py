@@ -191,11 +191,21 @@ def test_materials_and_sets_that_divide_a_label_leave_its_group_whole(version):
     assert sorted(read.cells_of_set("within")) == within.tolist()
 
 
-def test_labels_that_gmsh_has_no_number_for_are_refused():
+@pytest.mark.parametrize("suffix", [".msh", ".msh2", ".mesh", ".mfem"])
+def test_labels_too_large_for_numbers_are_numbered_from_1_with_a_table(suffix, tmp_path):
     model = labelled_model()
-    model = model._replace(cell_data={"label": np.full(len(model.mesh.cells), 10**8)}, sets=Sets({}, {}))
-    with pytest.raises(InputError, match="labels up to 99999999, got 100000000"):
-        gmsh41(model)
+    labels = np.arange(len(model.mesh.cells)) % 3 * 1_073_741_823 + (np.arange(len(model.mesh.cells)) % 3 == 2)
+    assert np.unique(labels).tolist() == [0, 1_073_741_823, 2**31 - 1]
+    model = model._replace(cell_data={"label": labels}, sets=Sets({}, {}), materials=None)
+    save_model(tmp_path / f"a{suffix}", model)
+    text = (tmp_path / f"a{suffix}").read_text()
+    word = {".mesh": "reference", ".mfem": "attribute"}.get(suffix, "physical group")
+    for number, label in ((1, 1_073_741_823), (2, 2**31 - 1)):
+        assert f"{word} {number} is label {label}\n" in text
+    assert "label_2147483647" in text
+    if suffix.startswith(".msh"):
+        read = load_mesh(tmp_path / f"a{suffix}").cell_data["label"]
+        np.testing.assert_array_equal(np.sort(read), np.sort(labels))
 
 
 @pytest.mark.parametrize("version", WRITERS)
@@ -474,7 +484,7 @@ def test_comments_of_others_are_not_ours():
     assert own_comments(["made by hand", "coordinates: LPS+, mm"]) is None
     assert own_comments(["tetopt was here"]) is None
     assert own_comments(["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]) == (
-        "ras", {"image": "a, b.nii"}, {}, {}, {}, None
+        "ras", {"image": "a, b.nii"}, {}, {}, {}, None, {}
     )  # fmt: skip
 
 

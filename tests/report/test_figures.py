@@ -297,7 +297,7 @@ def test_colours_are_told_apart_by_the_colour_blind(seen):
 
 def test_a_label_has_one_colour_whatever_else_is_there():
     """So that the cells' labels look as the voxels', and a subject's as another's; in the file's table, too."""
-    few, many = (label_colours(Image(np.array(rows))) for rows in ([[7, 7, 7, 0]], [[1, 2, 7, 0], [9, 9, 9, 9]]))
+    few, many = (label_colours(np.arange(n)) for n in (8, 10))
     assert (few.shape, many.shape) == ((8, 3), (10, 3))
     np.testing.assert_array_equal(few, many[:8])
     np.testing.assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
@@ -310,7 +310,7 @@ def test_a_label_has_one_colour_whatever_else_is_there():
 
 
 def test_labels_keep_colours_of_their_own_but_the_background():
-    labels = Image(np.array([[7, 7, 7, 0], [2, 2, 5, 0]]))
+    labels = np.array([0, 1, 2, 5, 7])
     colours = label_colours(labels, {0: (0, 0, 0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)})
     np.testing.assert_array_equal(colours[2], [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
@@ -318,24 +318,23 @@ def test_labels_keep_colours_of_their_own_but_the_background():
 
 def test_colours_begin_again_in_other_tints():
     n = len(LABEL_PALETTE)
-    colours = label_colours(Image(np.arange(3 * n + 2)[:, None]))
+    colours = label_colours(np.arange(3 * n + 2))
     assert len(np.unique(colours[: 3 * n + 1], axis=0)) == 3 * n + 1
     np.testing.assert_array_equal(colours[3 * n + 1], to_rgb(LABEL_PALETTE[0]))
-    with pytest.raises(InputError, match="whole numbers"):
-        label_colours(Image(np.array([[0.5, 1.0]])))
+    np.testing.assert_array_equal(label_colours(np.array([2**31 - 1]))[0], colours[1 + (2**31 - 2) % (3 * n)])
 
 
 def test_a_legend_lists_the_largest_and_counts_the_others():
     shown = np.array([50, 0, *range(1, LISTED_LABELS + 2)])  # 0, 2 .. 14; the least are 2 and 3
     colours = np.random.default_rng(0).uniform(size=(20, 3))
-    entries = legend_patches(colours, shown)
+    entries = legend_patches(np.arange(len(shown)), colours, shown)
     assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
     dollars = label_figure(blocks_of_labels(2), lattice_mesh(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS)
     FigureCanvasAgg(dollars).draw()  # which would parse a formula
-    named = legend_patches(colours, shown, {4: "left lung", 1: "not shown"})
+    named = legend_patches(np.arange(len(shown)), colours, shown, {4: "left lung", 1: "not shown"})
     assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
-    entries = legend_patches(colours, shown[:-2])
+    entries = legend_patches(np.arange(len(shown) - 2), colours, shown[:-2])
     assert [entry.get_label() for entry in entries] == [str(k) for k in (0, *range(2, 13))]
 
 
@@ -350,7 +349,7 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     labels = blocks_of_labels(4, worlds, signs)
     mesh = bent(labels, (3, 3, 2))
     grid = np.array(label_figure(labels, mesh).axes).reshape(3, 2)
-    colours, of_cell = label_colours(labels), cell_labels(labels, mesh)
+    colours, of_cell = label_colours(np.arange(4)), cell_labels(labels, mesh)
     for (left, right), normal in zip(grid, (2, 1, 0), strict=True):
         view = SliceView(labels, worlds.index(normal), None)
         np.testing.assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
@@ -383,7 +382,7 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
         np.testing.assert_array_equal(np.array(under.get_segments()), lines)
         _, sides = view.interfaces(mesh, of_cell)
         rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
-        np.testing.assert_array_equal(over.get_colors()[:, :3], label_colours(labels, table.colours)[rarer])
+        np.testing.assert_array_equal(over.get_colors()[:, :3], label_colours(np.arange(4), table.colours)[rarer])
         if worlds.index(normal) != 0:
             along = view.axes.index(0)
             np.testing.assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)

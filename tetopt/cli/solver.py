@@ -11,7 +11,7 @@ from rich.markup import escape
 from tetopt.cli.console import print_line, print_table
 from tetopt.io.formats import format_of
 from tetopt.io.gmsh import incomplete_groups
-from tetopt.io.tags import group_of_zero, label_lines, numbered_parts
+from tetopt.io.tags import group_labels, group_of_zero, label_lines, numbered_parts, renumbered_labels
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.inputs import listed
 from tetopt.job.options import SolverOptions
@@ -25,6 +25,7 @@ from tetopt.report.tables import new_table, nodes_in_words
 MOST_SETS = 20  # printed of facets, of cells, and of materials
 GMSH_SUFFIXES = (".msh", ".msh2")
 CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word for the number of a cell
+MOST_LABEL_LINES = 12  # about labels, of which a file may have hundreds
 
 
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
@@ -63,9 +64,11 @@ def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
     """Yield lines on what gmsh's formats cannot store: loads, label 0, and, in 2.2, a facet in several groups."""
     if model.loads:
         yield f"loads in {suffix} files are not read back; tetopt reads loads from VTK files only"
-    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    labels = group_labels(model)
     if labels is not None and labels.min() == 0:
         yield f"label 0 is physical group {group_of_zero(labels)}, as gmsh has no group 0"
+    if renumbered := [f"{number} is label {label}" for number, label in renumbered_labels(model).items()]:
+        yield f"physical groups number the labels, as large labels do not fit: {listed(renumbered)} (see $Comments)"
     if suffix == ".msh2" and (short := incomplete_groups(model)):
         yield (
             f"gmsh 2.2 has one group per facet: facets of smaller sets are missing from {', '.join(short)} (use .msh)"
@@ -106,7 +109,10 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:
-        yield from label_lines(model, numbered_parts(model)[0], CELL_NUMBERS[suffix])
+        lines = label_lines(model, numbered_parts(model)[0], CELL_NUMBERS[suffix])
+        yield from lines[:MOST_LABEL_LINES]
+        if len(lines) > MOST_LABEL_LINES:
+            yield f"and {len(lines) - MOST_LABEL_LINES} more; the file's header lists all"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (

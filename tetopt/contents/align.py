@@ -6,6 +6,7 @@ their shapes. The domain of a grid is the box of its voxels, from index -0.5 to 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -14,7 +15,8 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import check_labels
+from tetopt.contents.labels import checked_labels
+from tetopt.contents.memberships import finer_affine
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError, warn
 from tetopt.geometry.box import box_sides
@@ -25,6 +27,10 @@ SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole vo
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
 BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median, up to which voxels count as background
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
+COARSER_STEP = 1e-3  # of a voxel by which one may exceed another's size and count as equal
+LOST_FRACTION = 0.1  # of a label's volume, whose loss in resampling is reported
+PIECES_FACTOR = 2  # times its connected components, above which a label's pieces after resampling are reported
+REPORTED_LABELS = 5  # with the largest losses
 SMALL_COMPONENT_FRACTION = 0.01  # of the largest component's voxels: smaller components are ignored
 SUSPECT_VOXELS = 200  # of a bright piece: a larger one is hardly noise
 KEEP_PIECES = "`labels` keep what they number; a `mask` replaces the rule"
@@ -66,7 +72,12 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     inside = _mask_values(name, mask.data)
     moved = _moved(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
+        if (in_box(image, mask).astype(bool) & (inside >= INSIDE_FRACTION)).any():
+            raise InputError(f"{name}: the mask is lost between the centres of the image's larger voxels")
         raise InputError(f"{name}: the mask lies outside the image's box; {_both_boxes(mask, image)}")
+    _warn_of_loss(
+        name, "the mask", Image(inside >= INSIDE_FRACTION, mask.affine), Image(moved >= INSIDE_FRACTION, image.affine)
+    )
     return Image(moved, image.affine)
 
 
@@ -76,7 +87,8 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background; values within 1e-3 of these
+        are rounded, with a warning.
     image : Image
         Image with the target voxels.
     name : str, optional
@@ -85,12 +97,17 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Returns
     -------
     Image
-        Whole numbers as float32, with the image's shape and affine.
+        Whole numbers, with the image's shape and affine.
 
     Raises
     ------
     InputError
         A number of axes different from the image's, invalid labels, or no label above 0 in the image's box.
+
+    Warns
+    -----
+    UserWarning
+        Values were rounded; labels lose a tenth of their volume or fall into pieces, as the image's voxels are larger.
 
     Examples
     --------
@@ -100,13 +117,70 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     ((16, 16, 16), [0.0, 1.0])
     """
     _check_axes(name, labels, image)
-    check_labels(name, labels)
+    labels = checked_labels(name, labels, is_map=True)
     moved = _moved(labels, image)
     if labels.data.max() == 0:
         raise InputError(f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?")
     if moved.max() == 0:
+        if (labels.data * in_box(image, labels)).any():
+            raise InputError(f"{name}: the labels are lost between the centres of the image's larger voxels")
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
+    _warn_of_loss(name, "label", labels, Image(moved, image.affine))
     return Image(moved, image.affine)
+
+
+def divisions(image: Image, others: Iterable[Image]) -> tuple[int, ...]:
+    """Return into how many parts along each axis to divide an image's voxels so that none is larger than the others'.
+
+    An image's step along an axis is compared with the others' voxels that it passes, whatever their directions.
+    """
+    steps = [np.ones(image.ndim)]
+    for other in others:
+        passed = np.linalg.inv(other.affine[:-1, :-1]) @ image.affine[:-1, :-1]
+        steps.append(np.sqrt((passed**2).sum(axis=0)))
+    return tuple(int(k) for k in np.ceil(np.max(steps, axis=0) - COARSER_STEP))
+
+
+def divided(image: Image, factors: Sequence[int]) -> Image:
+    """Return the image on voxels divided by `factors` along the axes, each part with its voxel's value."""
+    data = image.data
+    for axis, factor in enumerate(factors):
+        data = np.repeat(data, factor, axis)
+    return image if max(factors) == 1 else Image(data, finer_affine(image.affine, factors))
+
+
+def _warn_of_loss(name: str, word: str, labels: Image, moved: Image) -> None:
+    """Warn of labels that vanish on the voxels of `moved`; on larger ones, also of lost volume and of pieces."""
+    if is_same_grid(labels, moved) or is_same_grid(labels, moved, is_cropped=True):
+        return
+    inside = np.where(in_box(moved, labels), labels.data, 0.0)
+    values, counts = np.unique(inside, return_counts=True)
+    left, counts_left = np.unique(moved.data, return_counts=True)
+    of_left = dict(zip(left.tolist(), (counts_left * moved.voxel_volume).tolist(), strict=True))
+    lost, pieces, is_coarser = list[tuple[float, str]](), list[str](), max(divisions(moved, [labels])) > 1
+    for value, volume in zip(values.tolist(), (counts * labels.voxel_volume).tolist(), strict=True):
+        which = word if word == "the mask" else f"{word} {value:.10g}"
+        fraction = 1.0 - of_left.get(value, 0.0) / volume
+        if value > 0.0 and (fraction > LOST_FRACTION if is_coarser else value not in of_left):
+            lost.append((fraction, f"{which} loses {fraction:.0%} of its volume ({volume:.3g} mm{labels.ndim})"))
+        elif value > 0.0 and is_coarser:
+            n_before, n_after = (_n_pieces(each == value) for each in (inside, moved.data))
+            if n_after > PIECES_FACTOR * n_before:
+                pieces.append(f"{which} falls into {n_after} pieces ({n_before} before)")
+    if lost or pieces:
+        every = [*(words for _, words in sorted(lost, reverse=True)), *pieces]
+        more = f"; and {len(every) - REPORTED_LABELS} more" * (len(every) > REPORTED_LABELS)
+        sizes = [" x ".join(f"{edge:.3g}" for edge in each.spacing) for each in (labels, moved)]
+        warn(
+            f"{name}: resampled from voxels of {sizes[0]} mm to {sizes[1]} mm; {'; '.join(every[:REPORTED_LABELS])}"
+            f"{more}; resample the image to the finer voxels to keep them"
+        )
+
+
+def _n_pieces(is_in: NDArray[np.bool_]) -> int:
+    """Number of face-connected components."""
+    boxes = scipy.ndimage.find_objects(is_in.astype(np.int8))
+    return int(scipy.ndimage.label(is_in[boxes[0]])[1]) if boxes else 0
 
 
 def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Image:

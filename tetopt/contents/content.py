@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
-from tetopt.contents.labels import BACKGROUND_LABEL, check_labels, label_channels
+from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
 from tetopt.contents.probabilities import check_tissues, probable_memberships, tissue_labels, warn_of_sums
@@ -92,6 +92,8 @@ class Content(NamedTuple):
         Statistics of the image, if a pass over its voxels has computed them.
     whole : Image, optional
         The first contrast as given, if `image` is another: a part of it, with other values beyond the mask, or divided.
+    repeats : tuple of int
+        Number of voxels along each axis that repeat one of the image's file; empty if none does.
 
     Examples
     --------
@@ -112,6 +114,7 @@ class Content(NamedTuple):
     keeps_components: bool = False
     statistics: Statistics | None = None
     whole: Image | None = None
+    repeats: tuple[int, ...] = ()
 
     @property
     def given(self) -> Image:
@@ -187,7 +190,12 @@ class Content(NamedTuple):
     @property
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
-        return float(sum(noise_level(values, self.inside) ** 2 for values in self.values[: self.n_contrasts]))
+        inside = None if self.inside is None else self.once(self.inside)
+        return float(sum(noise_level(self.once(values), inside) ** 2 for values in self.values[: self.n_contrasts]))
+
+    def once(self, values: NDArray) -> NDArray:
+        """Return one of each group of voxels that repeat one of the image's file."""
+        return values[tuple(slice(None, None, factor) for factor in self.repeats)]
 
 
 def content(
@@ -257,6 +265,7 @@ def content(
     tissues = _checked_tissues(tissues, labels)
     others = {f"tissues, number {number}": tissue for number, tissue in enumerate(tissues, 1)}
     _check(images, {"labels": labels, "mask": mask, **others}, weights, label_weight, smooth_interfaces)
+    labels = None if labels is None else checked_labels("labels", labels, is_map=True)
     region, beyond, whole = None, None, images[0]
     if mask is not None:
         beyond = continuation(mask, images[0].spacing)
@@ -443,8 +452,6 @@ def _check(
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
             raise InputError(f"{name}: expected the same voxel grid as the first image's; see tetopt.resample_mask")
     check_weights(len(images), weights, label_weight, smooth_interfaces)
-    if others["labels"] is not None:
-        check_labels("labels", others["labels"])
 
 
 def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -454,11 +461,9 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     channel. The weight of a label's voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small
     labels are not sacrificed for the surfaces of large ones; the total variance is 1 (0 for one label).
     """
-    counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
-    present = np.flatnonzero(counts)
-    row = np.zeros(len(counts), dtype=np.int64)
-    row[present] = np.arange(len(present))
-    number, fraction = row[labels], counts[present] / counts.sum()
+    present, counts = np.unique(labels if region is None else labels[region.inside], return_counts=True)
+    number, fraction = np.minimum(np.searchsorted(present, labels), len(present) - 1), counts / counts.sum()
+    number[present[number] != labels] = 0  # beyond the region
     size = fraction ** (-0.5 * RARITY_POWER)
     channel = label_channels(number, len(fraction))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)

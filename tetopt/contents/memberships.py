@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.labels import check_labels, label_channels
+from tetopt.contents.labels import checked_labels, label_channels
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
@@ -100,11 +100,12 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     InputError
         Labels that are not whole numbers from 0.
     """
-    check_labels("labels", labels)
+    labels = checked_labels("labels", labels)
     factors = tuple(factors or (1,) * labels.ndim)
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
-    values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
-    raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
+    values, row = np.unique(labels.data, return_inverse=True)
+    values, raw = values.astype(np.int64), row.reshape(labels.shape)
+    start = raw
     n_voxels = labels.data.size * prod(factors)
     what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:

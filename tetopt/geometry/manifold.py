@@ -82,11 +82,12 @@ def surface_ridges(surfaces: LabelSurfaces) -> Ridges:
     nodes = np.sort(surfaces.nodes[:, np.array(facet_nodes(n - 1))], axis=2)  # (S, n, n-1)
     place = nodes[..., 0] if n == 2 else nodes[..., 0] * base + nodes[..., 1]
     step = base ** (n - 1)
-    key = (surfaces.label[:, None] - OUTSIDE_LABEL) * step + place
+    labels, row = np.unique(surfaces.label, return_inverse=True)  # rows, as large labels would overflow the key
+    key = row.reshape(-1, 1) * step + place
     distinct, of_facet, n_facets = np.unique(key.ravel(), return_inverse=True, return_counts=True)
-    label, place = np.divmod(distinct, step)
+    row, place = np.divmod(distinct, step)
     at = place[:, None] if n == 2 else np.column_stack(np.divmod(place, base))
-    return Ridges(label + OUTSIDE_LABEL, at, n_facets, _times(place), of_facet.reshape(-1, n))
+    return Ridges(labels[row], at, n_facets, _times(place), of_facet.reshape(-1, n))
 
 
 def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:

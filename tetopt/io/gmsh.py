@@ -2,6 +2,7 @@
 
 Cells: each cell is in one physical group, as dolfinx requires. If cells have labels, the number of the group is the
 label, and its name is that of the label's set; gmsh has no group 0, so label 0 gets the number after the largest label.
+If a label exceeds 99,999,999, groups number the labels from 1, and the $Comments list the label of each group.
 Otherwise the group is that of its material, "material_1", ..., or without materials that of its cell set, or "unnamed"
 without a set; a cell set that overlaps a previous one, or has the name of a facet set, then has no group (dolfinx and
 meshio know groups only by name). An entity has the number of its group; only if sets, or in 2.2 materials, divide a
@@ -47,6 +48,7 @@ from tetopt.io.tags import (
     group_of_zero,
     numbered_parts,
     remarks,
+    renumbered_labels,
     tag_lines,
     without_data,
     without_labels,
@@ -62,6 +64,7 @@ ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh lists the midpoint of edge (2, 3) before that of (1, 3)
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
+NUMBER_COMMENT = "physical group {} is label {}"
 MOST_MATERIAL_GROUPS = 1000  # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
 
 
@@ -74,6 +77,7 @@ class OwnComments(NamedTuple):
     cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
     facets: dict[str, list[int]]  # entities of each facet set
     zero: int | None = None  # the group of label 0, if groups are labels
+    labels: dict[int, int] = {}  # noqa: RUF012 - by group, if labels are too large for groups; never modified
 
 
 def own_comments(lines: list[str]) -> OwnComments | None:
@@ -84,7 +88,7 @@ def own_comments(lines: list[str]) -> OwnComments | None:
     texts: dict[str, str] = {}
     constants: dict[str, tuple[float, float]] = {}
     entities: dict[str, dict[str, list[int]]] = {"cells": {}, "facets": {}}
-    zero = None
+    zero, labels = None, {}
     for line in lines:
         if match := re.fullmatch(r"units: mm, (\w+), .*", line):
             texts["units"] = match[1]
@@ -99,8 +103,10 @@ def own_comments(lines: list[str]) -> OwnComments | None:
             texts[MASK_TEXT] = match[1]
         elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
             zero = int(match[1])
+        elif match := re.fullmatch(NUMBER_COMMENT.format(r"(\d+)", r"(\d+)"), line):
+            labels[int(match[1])] = int(match[2])
     space = "lps" if coordinates[0].startswith("coordinates: LPS") else "ras"
-    return OwnComments(space, texts, constants, entities["cells"], entities["facets"], zero)
+    return OwnComments(space, texts, constants, entities["cells"], entities["facets"], zero, labels)
 
 
 def incomplete_groups(model: Model) -> list[str]:
@@ -251,6 +257,7 @@ def _entity_comments(model: Model, parts: list[Part]) -> list[str]:
     """Return comments on the entities of each set and, if groups are labels, a comment on that."""
     labels = group_labels(model)
     lines = [] if labels is None else [LABEL_COMMENT.format(group_of_zero(labels))]
+    lines += [NUMBER_COMMENT.format(*each) for each in renumbered_labels(model).items()]
     for part, what in zip(parts, ("cells", "facets"), strict=False):
         lines += tag_lines(part.sets, f"entity of {what}")
     return lines

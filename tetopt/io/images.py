@@ -196,7 +196,7 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
 def save_image(path: str | Path, image: Image) -> None:
     """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm; or OME-Zarr.
 
-    Whole numbers are stored as 8- or 16-bit integers if they fit, others as float32 or float64. An axis with more
+    Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or float64. An axis with more
     voxels than NIfTI-1 supports makes it a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged. Replaces an existing
@@ -246,7 +246,7 @@ def save_image(path: str | Path, image: Image) -> None:
 def _for_file(data: NDArray[np.floating]) -> NDArray:
     """Convert small whole numbers to integers, so that programs recognise labels; return other data unchanged."""
     low, high = data.min(), data.max()
-    for dtype in (np.uint8, np.int16):
+    for dtype in (np.uint8, np.int16, np.int32):
         if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max and np.array_equal(np.rint(data), data):
             return data.astype(dtype)
     return data

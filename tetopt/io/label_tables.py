@@ -28,8 +28,8 @@ from tetopt.system.incoming import irregular, text_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
-SNAP_LINE = re.compile(r'\s*(\d{1,9})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*')
-LUT_LINE = re.compile(r"\s*(\d{1,9})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
+SNAP_LINE = re.compile(r'\s*(\d{1,10})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*')
+LUT_LINE = re.compile(r"\s*(\d{1,10})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
 # Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
 NAME_COLUMNS = ("name", "labelname", "structure", "structures", "region", "type_codemeaning", "label")
@@ -168,7 +168,7 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
             raise InputError(
                 f'{path}, line {number}: expected {len(rows[0])} columns, as in the first row, got "{line}"'
             )
-        if re.fullmatch(r"\d{1,9}(\.0*)?", cells[label]) is None:
+        if re.fullmatch(r"\d{1,10}(\.0*)?", cells[label]) is None:
             raise InputError(
                 f'{path}, line {number}: expected a whole number from 0 in column {label}, got "{cells[label]}"'
             )

@@ -89,10 +89,14 @@ def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
     if is_other or not (n_groups == 1).all():
         return raw
     zero = None if comments is None else comments.zero
+    of_group = {} if comments is None else comments.labels
+    if of_group:
+        labels = np.array([of_group.get(number, number) for number in labels.tolist()], dtype=np.int64)
     labels[labels == zero] = 0
     if "label" in raw.cell_data and not np.array_equal(raw.cell_data["label"][kind], labels):
         return raw
-    names = {group.number: group.label for group in groups if group.label != f"label_{group.number}"}
+    names = {of_group.get(group.number, group.number): group.label for group in groups}
+    names = {number: name for number, name in names.items() if name != f"label_{number}"}
     names = {0 if number == zero else number: name for number, name in names.items() if name != "label_0"}
     table = {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
     cell_data = raw.cell_data | {"label": {kind: labels}}

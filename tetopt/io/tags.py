@@ -1,12 +1,13 @@
 """Shared code of mesh formats that have numbers for materials and sets, and comments for other data.
 
 `numbered_parts` gives each cell and each facet of a set one number. If cells have labels, the number of a cell is its
-label; label 0, which formats treat as none, gets the number after the largest label. Otherwise it is the number of the
-cell's material, or without materials that of its cell set. If sets or materials divide such a group, each of its parts
-has its own number, after all others. The numbers of facets differ from those of cells. For a given R, those of the
-box's faces, "mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets are
-numbered from R + 1 in order, so that their numbers depend on the sets of the mesh. R is 1000, or a power of ten above
-all labels. Parts are numbered from 2 R + 1.
+label; label 0, which formats treat as none, gets the number after the largest label. If a label exceeds
+`LARGEST_GROUP`, labels are numbered from 1, and comments list the label of each number. Otherwise it is the number of
+the cell's material, or without materials that of its cell set. If sets or materials divide such a group, each of its
+parts has its own number, after all others. The numbers of facets differ from those of cells. For a given R, those of
+the box's faces, "mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets
+are numbered from R + 1 in order, so that their numbers depend on the sets of the mesh. R is 1000, or a power of ten
+above all labels. Parts are numbered from 2 R + 1.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, MOST_L
 
 UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
 LEAST_ROOM = 1000  # numbers reserved for labels
-LARGEST_GROUP = 10**8 - 1  # largest label: twice the next power of ten still fits into the format's 32 bits
+LARGEST_GROUP = 10**8 - 1  # largest label used as a number: twice the next power of ten still fits into 32 bits
 
 
 class Tagged(NamedTuple):
@@ -120,11 +121,17 @@ def group_of_zero(labels: NDArray[np.int64]) -> int:
 
 
 def group_labels(model: Model) -> NDArray[np.int64] | None:
-    """Return the cells' labels (M,), if any; InputError for a label that does not fit into 32 bits."""
+    """Return the numbers of the cells' labels (M,), if any: the labels, unless there are `renumbered_labels`."""
+    labels, renumbered = labels_of(model.cell_data, len(model.mesh.cells)), renumbered_labels(model)
+    return labels if labels is None or not renumbered else np.searchsorted([0, *renumbered.values()], labels)
+
+
+def renumbered_labels(model: Model) -> dict[int, int]:
+    """Return the label of each number from 1, if a label exceeds `LARGEST_GROUP`; else none."""
     labels = labels_of(model.cell_data, len(model.mesh.cells))
-    if labels is not None and labels.max() > LARGEST_GROUP:
-        raise InputError(f"expected labels up to {LARGEST_GROUP}, got {labels.max()}; renumber them from 1")
-    return labels
+    if labels is None or labels.max() <= LARGEST_GROUP:
+        return {}
+    return dict(enumerate(np.unique(labels[labels > 0]).tolist(), 1))
 
 
 def without_labels(model: Model) -> Model:
@@ -141,7 +148,7 @@ def numbered_parts(model: Model) -> tuple[Part, Part]:
     Raises
     ------
     InputError
-        A set has the name of a material, a label or the group of other cells; a label exceeds `LARGEST_GROUP`.
+        A set has the name of a material, a label or the group of other cells.
     """
     labels, n_facets = group_labels(model), len(model.sets.facets)
     names, group = _cell_groups(model, labels)
@@ -171,7 +178,9 @@ def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[i
     """Return the names of the cells' groups by number, ascending, and the number of each cell's group."""
     if labels is not None:
         kinds = np.unique(labels).tolist()
-        called = label_set_names(kinds, table_of_words(model.about.get(TABLE_TEXT)).names)
+        own = [renumbered_labels(model).get(kind, kind) for kind in kinds]
+        of_label = label_set_names(own, table_of_words(model.about.get(TABLE_TEXT)).names)
+        called = {kind: of_label[label] for kind, label in zip(kinds, own, strict=True)}
         zero = group_of_zero(labels)
         others = {
             name: members
@@ -316,7 +325,11 @@ def label_lines(model: Model, cells: Part, what: str) -> list[str]:
     if labels is None:
         return []
     divided = sorted({group for number, (group,) in cells.groups_of.items() if number != group})
+    renumbered = renumbered_labels(model)
     zero, lines = group_of_zero(labels), [f"the {what} of a cell is its label"]
+    if renumbered:
+        lines[0] = f"the {what} of a cell numbers its label from 1, as labels above {LARGEST_GROUP} do not fit"
+        lines += [f"{what} {number} is label {label}" for number, label in renumbered.items()]
     if zero in cells.names and zero not in divided:
         lines.append(f"label 0 is {what} {zero}, because 0 means none")
     if divided:

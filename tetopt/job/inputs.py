@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from tetopt.contents.align import (
     SAME_BOX_VOXELS,
     SAME_GRID_VOXELS,
+    divided,
+    divisions,
     in_box,
     is_same_grid,
     other_box,
@@ -24,7 +27,7 @@ from tetopt.contents.align import (
 )
 from tetopt.contents.content import SMOOTH_INTERFACES, Content, continuation, continued
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import check_labels
+from tetopt.contents.labels import checked_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -38,11 +41,13 @@ from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, own_mask
 from tetopt.model.labels import NO_TABLE, TABLE_TEXT, labels_of, table_words
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
+from tetopt.system.budget import available_bytes, memory_words
 from tetopt.system.files import checked_output
 from tetopt.system.incoming import rows_of
 
 OUTSIDE_FRACTION = 0.02  # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
+DIVIDED_BYTES = 300.0  # per voxel of a run with labels, measured
 NAMES_LISTED = 8  # as many as fit on a line
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
@@ -74,8 +79,7 @@ def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
             f"{path}: expected labels on the image's grid, {image.shape} with its affine, got {labels.shape}; "
             "resample them to the image first"
         )
-    check_labels(str(path), labels)
-    return labels
+    return checked_labels(str(path), labels, is_map=True)
 
 
 def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
@@ -84,26 +88,70 @@ def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tup
     return image, None if labels_path is None else read_labels(labels_path, image, part)
 
 
-def image_and_others(
-    path: Path, part: ImagePart
-) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:
-    """Read the selected part of an image; return it and a function that reads other files and aligns them to it."""
+class Aligned(NamedTuple):
+    """An image, and a function that reads other files and aligns them to it."""
+
+    image: Image
+    beside: Callable[[Path, Callable[[Image, Image, str], Image]], Image]
+    factors: tuple[int, ...]  # parts of the file's voxels along each axis
+
+
+def image_and_others(path: Path, part: ImagePart, finest: Sequence[Path | None] = ()) -> Aligned:
+    """Read the selected part of an image, on voxels divided to the size of the `finest` files' (labels or a mask)."""
     image = read_image(path, part)
     # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
-    whole = image if part.slice_ is None else read_image(path, ImagePart(volume=part.volume))
+    slice_ = None if part.slice_ is None else parse_slice(part.slice_)
+    whole = coarse = image if slice_ is None else read_image(path, ImagePart(volume=part.volume))
+    crop = None if part.crop is None else parse_crop(part.crop)
+    originals = {other: read_companion(other) for other in finest if other is not None}
+    factors = _divisions(whole, originals, None if slice_ is None else slice_[0])
+    if max(factors) > 1:
+        whole = divided(whole, factors)
+        if crop is not None:
+            crop = [
+                (None if a is None else a * f, None if b is None else b * f)
+                for (a, b), f in zip(crop, factors, strict=True)
+            ]
+        image = whole if slice_ is None else part_of(whole, slice_, crop)
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        original = read_companion(other)
-        moved = aligned(original, whole, str(other))
-        is_cropped = part.slice_ is None and part.crop is not None
-        if not is_same_grid(original, whole, is_cropped=is_cropped):
+        original = originals[other] if other in originals else read_companion(other)
+        # A contrast is divided like the image, so that on the same voxels it keeps its values.
+        grid = coarse if aligned is resample_contrast else whole
+        moved = aligned(original, grid, str(other))
+        moved = divided(moved, factors) if aligned is resample_contrast else moved
+        is_cropped = slice_ is None and crop is not None
+        if not is_same_grid(original, grid, is_cropped=is_cropped):
             is_linear = aligned in (resample_contrast, resample_tissue)
             _say_resampled(other, original, moved, is_contrast=is_linear, is_cropped=is_cropped)
-        if part.slice_ is None:
-            return moved
-        return part_of(moved, parse_slice(part.slice_), None if part.crop is None else parse_crop(part.crop))
+        return moved if slice_ is None else part_of(moved, slice_, crop)
 
-    return image, beside
+    if slice_ is not None:
+        factors = tuple(factor for axis, factor in enumerate(factors) if axis != slice_[0])
+    return Aligned(image, beside, factors)
+
+
+def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> tuple[int, ...]:
+    """Return the parts of the image's voxels along each axis, with a message; fewer if memory is short.
+
+    Voxels are not divided along the axis `across` a slice.
+    """
+    finer = {path: other for path, other in others.items() if other.ndim == image.ndim}
+    needed = [1 if axis == across else k for axis, k in enumerate(divisions(image, finer.values()))]
+    factors, n_free = list(needed), available_bytes()
+    while max(factors) > 1 and DIVIDED_BYTES * prod((*image.shape, *factors)) > n_free:
+        factors[int(np.argmax(factors))] -= 1
+    if max(needed) > 1:
+        names = listed([path for path, other in finer.items() if max(divisions(image, [other])) > 1])
+        note(
+            f"{names}: finer than the image, whose voxels are divided by {_times(factors)}"
+            + (f" instead of {_times(needed)}, as only {memory_words(n_free)} of memory are free" * (factors != needed))
+        )
+    return tuple(factors)
+
+
+def _times(factors: Sequence[int]) -> str:
+    return " x ".join(map(str, factors))
 
 
 def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
@@ -235,7 +283,7 @@ def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshF
     InputError
         As for `mask_for`; the image's dimension differs from the mesh's.
     """
-    whole, beside = image_and_others(path, part)
+    whole, beside, _ = image_and_others(path, part, [options.mask])
     if whole.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
     mask = mask_for(options, whole, beside, loaded)
@@ -247,8 +295,7 @@ def with_labels(loaded: MeshFile, path: Path | None, options: MaskPart) -> MeshF
     """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
     if path is None:
         return loaded
-    labels = read_companion(path)
-    check_labels(str(path), labels)
+    labels = checked_labels(str(path), read_companion(path), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 

@@ -129,7 +129,7 @@ def read_source(
     background in the options, that of a mesh's file counts, if one was `loaded`.
     """
     paths = options.images
-    image, beside = image_and_others(paths[0], options)
+    image, beside, factors = image_and_others(paths[0], options, [options.labels, options.mask])
     labels, table, numbers, tissues, is_own = _labelling(options, image, beside, label_names, numbers)
     if labels is not None and is_own and numbers:
         image = labels
@@ -150,6 +150,8 @@ def read_source(
         contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
         keep_components=options.keep_components, keep_volumes=not options.free_volumes,
     )  # fmt: skip
+    if max(factors) > 1:
+        represented = represented._replace(repeats=factors)
     of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
     files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
     inputs = {
@@ -160,6 +162,7 @@ def read_source(
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({"free_volumes": True} if options.free_volumes else {}),
         **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
+        **({"divided": factors} if max(factors) > 1 else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip

@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL, check_labels
+from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL, checked_labels
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box
@@ -226,7 +226,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     >>> np.bincount(of_cell).tolist()
     [1063, 137]
     """
-    check_labels("labels", labels)
+    labels = checked_labels("labels", labels)
     return _majority(labels, mesh, cell_of_voxel(labels, mesh))
 
 
@@ -272,15 +272,19 @@ def label_fidelity(
     label 0: Dice 1.00, off by 0.6 mm
     label 1: Dice 1.00, off by 0.6 mm
     """
-    check_labels("labels", labels)
+    labels = checked_labels("labels", labels)
     owner = cell_of_voxel(labels, mesh)
     label_of_cell = _majority(labels, mesh, owner) if of_cell is None else checked_cell_labels(of_cell, mesh)
-    true, painted = labels_in_mask(labels, mask), _painted(owner, label_of_cell)
-    outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
+    values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
+    painted, outside = _painted(owner, label_of_cell), BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
     painted[owner < 0] = outside
-    n_true, n_painted, n_both = (_counts(v[v >= 0]) for v in (true, painted, true[true == painted]))
-    n_cells, mesh_volume = _counts(label_of_cell), _counts(label_of_cell, volumes(mesh.points, mesh.cells))
-    n_empty = _counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
+
+    def counts(rows: NDArray[np.integer], weights: NDArray | None = None) -> NDArray:
+        return np.bincount(rows.ravel(), weights, len(values))
+
+    n_true, n_painted, n_both = (counts(v[v >= 0]) for v in (true, painted, true[true == painted]))
+    n_cells, mesh_volume = counts(label_of_cell), counts(label_of_cell, volumes(mesh.points, mesh.cells))
+    n_empty = counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
     overlap, beyond = _overlaps(Image(true, labels.affine), mesh, label_of_cell, len(n_true))
     has_outside = (np.arange(len(n_true)) == outside).astype(float)
     boxes = scipy.ndimage.find_objects(true + 1)
@@ -289,32 +293,32 @@ def label_fidelity(
     one_layer = one_layer_fractions(mesh, label_of_cell, shared)
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
-    for label in np.flatnonzero(n_true):
-        part, affine = _with_margin(labels, true, boxes[label])
-        is_side = (sides == label).sum(axis=1) == 1
+    for row in np.flatnonzero(n_true):
+        part, affine = _with_margin(labels, true, boxes[row])
+        is_side = (sides == row).sum(axis=1) == 1
         distances = np.concatenate(
-            _distances(FacetSurface(mesh.points, nodes[is_side]), half_level_surface(part == label, affine), face)
+            _distances(FacetSurface(mesh.points, nodes[is_side]), half_level_surface(part == row, affine), face)
         )
         rows.append(
             LabelFidelity(
-                int(label),
-                int(n_true[label]),
-                float(n_true[label] * labels.voxel_volume),
-                float(mesh_volume[label]),
-                int(n_cells[label]),
-                int(n_empty[label]),
-                _dice(n_both[label], n_true[label], n_painted[label]),
+                int(values[row]),
+                int(n_true[row]),
+                float(n_true[row] * labels.voxel_volume),
+                float(mesh_volume[row]),
+                int(n_cells[row]),
+                int(n_empty[row]),
+                _dice(n_both[row], n_true[row], n_painted[row]),
                 _dice(
-                    overlap[label] + has_outside[label] * beyond[0],
-                    n_true[label] * labels.voxel_volume,
-                    mesh_volume[label] + has_outside[label] * beyond[1],
+                    overlap[row] + has_outside[row] * beyond[0],
+                    n_true[row] * labels.voxel_volume,
+                    mesh_volume[row] + has_outside[row] * beyond[1],
                 ),
                 *_mean_and_p95(distances),
-                int(scipy.ndimage.label(part == label)[1]),
-                _n_components(mesh.cells[label_of_cell == label]),
-                bool(n_cells[label] == 0 and (label != outside or owner.min() >= 0)),
+                int(scipy.ndimage.label(part == row)[1]),
+                _n_components(mesh.cells[label_of_cell == row]),
+                bool(n_cells[row] == 0 and (row != outside or owner.min() >= 0)),
                 float(distances.max(initial=0.0)) if len(distances) else np.nan,
-                one_layer.get(int(label), np.nan),
+                one_layer.get(int(row), np.nan),
             )
         )
     return rows
@@ -518,8 +522,13 @@ def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     return values.astype(np.int64)
 
 
-def _counts(values: NDArray, weights: NDArray | None = None) -> NDArray:
-    return np.bincount(values, weights, minlength=LARGEST_LABEL + 1)
+def by_row(
+    labels: NDArray[np.int32], of_cell: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for `OUTSIDE_LABEL`."""
+    values = np.unique(np.concatenate([[0], np.unique(labels[labels >= 0]), of_cell]))
+    rows = np.where(labels >= 0, np.searchsorted(values, labels), OUTSIDE_LABEL).astype(np.int32)
+    return values, rows, np.searchsorted(values, of_cell)
 
 
 def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:

@@ -19,12 +19,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.contents.labels import check_labels
+from tetopt.contents.labels import checked_labels
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.topology import Facets, facets, linked
 from tetopt.image import Image, transformed
-from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, labels_in_mask, surface_areas
+from tetopt.measure.fidelity import FacetSurface, by_row, checked_cell_labels, labels_in_mask, surface_areas
 from tetopt.mesh import Mesh
 
 FOLD_DEGREES = 60.0  # least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
@@ -127,16 +127,15 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
     >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # without handles
     (0, 0, 2)
     """
-    check_labels("labels", labels)
-    of_cell = checked_cell_labels(of_cell, mesh)
-    voxels = labels_in_mask(labels, mask)
+    labels = checked_labels("labels", labels)
+    values, voxels, of_cell = by_row(labels_in_mask(labels, mask), checked_cell_labels(of_cell, mesh))
     boxes = scipy.ndimage.find_objects(voxels + 1)
-    present = np.array([label for label, box in enumerate(boxes) if box is not None])
+    present = np.array([row for row, box in enumerate(boxes) if box is not None])
     shared = facets(mesh.cells)
     surfaces = label_surfaces(shared, of_cell)
     ridges = surface_ridges(surfaces)
     fans = surface_fans(surfaces, ridges)
-    n_labels = int(max(of_cell.max(), present.max())) + 1
+    n_labels = len(values)
 
     def counts(which: NDArray[np.int64], weights: NDArray | None = None) -> NDArray:
         """Counts by label, without the outside."""
@@ -155,20 +154,20 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
     area = counts(surfaces.label, surface_areas(FacetSurface(mesh.points, surfaces.nodes)))
     n_folded, n_paired = counts(ridges.label[turns > FOLD_DEGREES]), counts(ridges.label[np.isfinite(turns)])
     rows = []
-    for label in present.tolist():
-        is_label = np.pad(voxels[boxes[label]] == label, 1)
+    for row in present.tolist():
+        is_label = np.pad(voxels[boxes[row]] == row, 1)
         is_large = np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim]
         smooth_area = float(surface_areas(smooth_surface(is_label, labels.affine)).sum())
         rows.append(
             LabelInterface(
-                label=label,
-                area=float(area[label]),
+                label=int(values[row]),
+                area=float(area[row]),
                 smooth_area=smooth_area,
-                area_ratio=float(area[label]) / smooth_area if area[label] > 0.0 and is_large else np.nan,
-                folded=float(n_folded[label] / n_paired[label]) if n_paired[label] else np.nan,
+                area_ratio=float(area[row]) / smooth_area if area[row] > 0.0 and is_large else np.nan,
+                folded=float(n_folded[row] / n_paired[row]) if n_paired[row] else np.nan,
                 euler=voxel_euler(is_label),
                 cavities=voxel_cavities(is_label),
-                **{name: int(values[label]) for name, values in of_label.items()},
+                **{name: int(counted[row]) for name, counted in of_label.items()},
             )
         )
     return rows

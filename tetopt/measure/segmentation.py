@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, own_image
-from tetopt.contents.labels import check_labels
+from tetopt.contents.labels import checked_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
@@ -67,8 +67,8 @@ def thresholded(image: Image, classes: int, inside: NDArray[np.bool_] | None = N
 
 def stands_for(labels: Image, truth: Image) -> dict[int, int]:
     """The most frequent true label of each class's voxels; arguments as for `dice`."""
-    table = _table(labels, truth)
-    return {int(c): int(table[c].argmax()) for c in np.flatnonzero(table.sum(axis=1))}
+    classes, true, table = _table(labels, truth)
+    return dict(zip(classes.tolist(), true[table.argmax(axis=1)].tolist(), strict=True))
 
 
 def dice(labels: Image, truth: Image) -> dict[int, float]:
@@ -82,21 +82,22 @@ def dice(labels: Image, truth: Image) -> dict[int, float]:
     InputError
         Images of different shapes, or labels that are not whole numbers from 0.
     """
-    table = _table(labels, truth)
+    _, true, table = _table(labels, truth)
     chosen = table.argmax(axis=1)
     overlaps = {}
-    for label in np.flatnonzero(table.sum(axis=0)):
-        rows = table[(chosen == label) & (table.sum(axis=1) > 0)]
-        overlaps[int(label)] = float(2 * rows[:, label].sum() / (rows.sum() + table[:, label].sum()))
+    for column, label in enumerate(true.tolist()):
+        rows = table[chosen == column]
+        overlaps[label] = float(2 * rows[:, column].sum() / (rows.sum() + table[:, column].sum()))
     return overlaps
 
 
-def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
-    """Number of voxels of each class (rows) and true label (columns)."""
+def _table(labels: Image, truth: Image) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The classes, the true labels, and the number of voxels of each class (rows) and true label (columns)."""
     if labels.shape != truth.shape:
         raise InputError(f"dice: expected images of the same shape, got {labels.shape} and {truth.shape}")
-    for name, image in (("labels", labels), ("truth", truth)):
-        check_labels(name, image)
-    classes, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
-    shape = (int(classes.max()) + 1, int(true.max()) + 1)
-    return np.bincount(classes * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)
+    named = {"labels": labels, "truth": truth}
+    of_each = [np.unique(checked_labels(name, image).data, return_inverse=True) for name, image in named.items()]
+    (classes, row), (true, column) = of_each
+    shape = (len(classes), len(true))
+    counts = np.bincount(row.ravel() * shape[1] + column.ravel(), minlength=shape[0] * shape[1]).reshape(shape)
+    return classes.astype(np.int64), true.astype(np.int64), counts

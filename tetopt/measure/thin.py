@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
-from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.contents.labels import LARGEST_LABEL, checked_labels
 from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, local_thickness, thickness_between
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
@@ -97,7 +97,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     ...     print(each.labels, f"{each.ratio:.2f}")
     (0, 1) 0.98
     """
-    check_labels("labels", labels)
+    labels = checked_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
     shared = facets(mesh.cells)
     sides = of_cell[shared.cells]
@@ -138,7 +138,7 @@ def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
 
 def _by_pair(one: NDArray, other: NDArray, weights: NDArray[np.float64] | None = None) -> dict[int, float]:
     """Sums over pairs of labels, by the number of the pair."""
-    pairs = np.minimum(one, other) * np.int64(LABEL_BASE) + np.maximum(one, other)
+    pairs = np.minimum(one, other).astype(np.int64) * LABEL_BASE + np.maximum(one, other)
     numbers, place = np.unique(pairs, return_inverse=True)
     return dict(zip(numbers.tolist(), np.bincount(place, weights, len(numbers)).astype(float).tolist(), strict=True))
 

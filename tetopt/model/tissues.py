@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.contents.labels import LARGEST_LABEL, checked_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.model.labels import labels_named
@@ -19,8 +20,8 @@ from tetopt.system.incoming import rows_of, toml_of
 
 REST = "*"  # all labels in no other group, except 0
 UNGROUPED_LISTED = 20  # labels listed in a message
-GROUP = re.compile(r"\s*(?:(\d{1,9})\s*:)?\s*([^=:;*]*[^=:;*\s])\s*=([^=;]*)")
-RANGE = re.compile(r"(\d{1,9})(?:\s*-\s*(\d{1,9}))?")
+GROUP = re.compile(r"\s*(?:(\d{1,10})\s*:)?\s*([^=:;*]*[^=:;*\s])\s*=([^=;]*)")
+RANGE = re.compile(r"(\d{1,10})(?:\s*-\s*(\d{1,10}))?")
 
 
 class LabelGroup(NamedTuple):
@@ -91,27 +92,26 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     >>> merged.labels.data.tolist(), merged.names
     ([[0.0, 1.0, 1.0, 2.0, 5.0]], {1: 'white', 2: 'grey', 5: 'soft'})
     """
-    check_labels("labels", labels)
-    groups = groups_of(merge)
-    owner, rest = _members(groups, names or {})
-    present = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel())).tolist()
+    labels = checked_labels("labels", labels)
+    groups, present = groups_of(merge), np.unique(labels.data).astype(np.int64)
+    owner, rest = _members(groups, names or {}, present)
     owner.setdefault(0, 0)
-    lost = [label for label in present if label not in owner]
+    lost = [label for label in present.tolist() if label not in owner]
     if lost and rest is None:
         listed = ", ".join(map(str, lost[:UNGROUPED_LISTED])) + (", ..." if len(lost) > UNGROUPED_LISTED else "")
         raise InputError(
             f"`merge`: expected each label of the image in a group, got no group for {listed}; add them to a group, or "
             f"give NAME={REST} for all others"
         )
-    numbers = {label: owner.get(label, rest or 0) for label in present}
+    numbers = {label: owner.get(label, rest or 0) for label in present.tolist()}
     return Merged(renumbered(labels, numbers), {group.label: group.name for group in groups}, numbers)
 
 
 def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
     """Renumber labels; labels without a new number are unchanged."""
-    table = np.arange(LARGEST_LABEL + 1, dtype=labels.data.dtype)
-    table[list(numbers)] = list(numbers.values())
-    return Image(table[labels.data.astype(np.uint16)], labels.affine)
+    present, row = np.unique(labels.data, return_inverse=True)
+    new = np.array([numbers.get(label, label) for label in present.astype(np.int64).tolist()], dtype=np.float64)
+    return Image(new[row].reshape(labels.shape), labels.affine)
 
 
 def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
@@ -180,8 +180,10 @@ def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelG
     return groups
 
 
-def _members(groups: list[LabelGroup], names: Mapping[int, str]) -> tuple[dict[int, int], int | None]:
-    """Return the number of the group of each label, and that of all other labels."""
+def _members(
+    groups: list[LabelGroup], names: Mapping[int, str], present: NDArray[np.int64]
+) -> tuple[dict[int, int], int | None]:
+    """Return the number of the group of each label, in ranges of those present, and that of all other labels."""
     owner: dict[int, int] = {}
     rest = None
     for group in groups:
@@ -189,14 +191,14 @@ def _members(groups: list[LabelGroup], names: Mapping[int, str]) -> tuple[dict[i
             if word == REST:
                 rest = group.label
                 continue
-            for label in _labels_of(word, names):
+            for label in _labels_of(word, names, present):
                 if owner.setdefault(label, group.label) != group.label:
                     other = next(each.name for each in groups if each.label == owner[label])
                     raise InputError(f"`merge`: label {label} is in two groups, {other} and {group.name}; list it once")
     return owner, rest
 
 
-def _labels_of(word: str, names: Mapping[int, str]) -> list[int]:
+def _labels_of(word: str, names: Mapping[int, str], present: NDArray[np.int64]) -> list[int]:
     """Return the labels that a number, a range or a name refers to."""
     if (match := RANGE.fullmatch(word)) is None:
         try:
@@ -206,7 +208,7 @@ def _labels_of(word: str, names: Mapping[int, str]) -> list[int]:
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last <= LARGEST_LABEL:
         raise InputError(f"`merge`: expected labels or an increasing range up to {LARGEST_LABEL}, got {word}")
-    return list(range(first, last + 1))
+    return [first] if first == last else present[(first <= present) & (present <= last)].tolist()
 
 
 @cache

@@ -8,16 +8,17 @@ import numpy as np
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tetopt.contents.labels import check_labels, colours_by_number
-from tetopt.image import Image
+from tetopt.contents.labels import colours_by_number
 from tetopt.io.text import plain
 
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more could not be distinguished by colour alone
 
 
-def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] | None = None) -> NDArray[np.float64]:
-    """Return the colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
+def label_colours(
+    labels: NDArray[np.int64], own: Mapping[int, tuple[float, float, float]] | None = None
+) -> NDArray[np.float64]:
+    """Return the colour of each label.
 
     A label has the same colour in all pictures: its `own`, e.g. from `tetopt.model.labels.LabelTable.colours`, or
     that of its number (`tetopt.contents.labels.colours_by_number`). 0, the background, is always light grey, although
@@ -25,25 +26,19 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
 
     Parameters
     ----------
-    labels : Image
-        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
+    labels : (K,) int64
+        Numbers from 0.
     own : mapping of label to red, green and blue, 0 to 1, optional
 
     Returns
     -------
-    (largest label + 1, 3) float64
+    (K, 3) float64
         Red, green and blue, 0 to 1.
-
-    Raises
-    ------
-    InputError
-        Labels are not whole numbers in this range.
     """
-    check_labels("labels", labels)
-    colours = colours_by_number(np.arange(int(labels.data.max()) + 1))
-    for label, colour in (own or {}).items():
-        if 0 < label < len(colours):
-            colours[label] = colour
+    colours = colours_by_number(labels)
+    for row, label in enumerate(labels.tolist()):
+        if label > 0 and own and label in own:
+            colours[row] = own[label]
     return colours
 
 
@@ -59,15 +54,18 @@ def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[flo
 
 
 def legend_patches(
-    colours: NDArray[np.float64], shown: NDArray[np.integer], names: Mapping[int, str] | None = None
-) -> list[Patch]:
+    labels: NDArray[np.int64], colours: NDArray[np.float64], shown: NDArray[np.integer],
+    names: Mapping[int, str] | None = None,
+) -> list[Patch]:  # fmt: skip
     """Return a legend's entries: the `LISTED_LABELS` labels that cover most, ascending, and the number of others.
 
     Parameters
     ----------
+    labels : (K,) int64
+        Numbers, ascending.
     colours : (K, 3) float64
         The result of `label_colours`.
-    shown : (up to K,) integer
+    shown : (K,) integer
         Visible amount of each label, in any unit; labels with 0 are not listed.
     names : mapping of label to text, optional
         Names of labels.
@@ -76,12 +74,12 @@ def legend_patches(
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]
     entries = [
         Patch(
-            facecolor=colours[label],
+            facecolor=colours[row],
             edgecolor="black",
             linewidth=0.5,
-            label=plain_text(f"{label} {names.get(label, '')}".strip()),
+            label=plain_text(f"{labels[row]} {names.get(int(labels[row]), '')}".strip()),
         )
-        for label in np.sort(by_size[:LISTED_LABELS]).tolist()
+        for row in np.sort(by_size[:LISTED_LABELS]).tolist()
     ]
     if len(by_size) > LISTED_LABELS:
         entries.append(Patch(facecolor="none", label=f"and {len(by_size) - LISTED_LABELS} more"))

@@ -247,8 +247,7 @@ def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[in
     labels = np.unique(values).astype(np.int64)
     if len(labels) > MOST_CATEGORIES:
         return []
-    colours = label_colours(Image(values[:, None]), table.colours)
-    return [(int(label), to_hex(colours[label])) for label in labels]
+    return list(zip(labels.tolist(), map(to_hex, label_colours(labels, table.colours)), strict=True))
 
 
 def _checked_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:

@@ -151,22 +151,24 @@ def label_figure(
     InputError
         For the reasons of `tetopt.measure.fidelity.cell_labels`.
     """
-    colours = label_colours(labels, table.colours)
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
-    views = _middle_views(labels)
+    values = np.unique(np.concatenate([np.unique(labels.data).astype(np.int64), of_cell]))
+    of_cell = np.searchsorted(values, of_cell)  # rows of these, of which there are fewer than numbers
+    colours = label_colours(values, table.colours)
+    views = _middle_views(Image(np.searchsorted(values, labels.data), labels.affine))
     pixels = [view.pixels.astype(np.int64) for view in views]
     cuts = [view.section(mesh) for view in views]
     shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
     inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # per mm
-    handles, n_columns = legend_patches(colours, shown, table.names), 2 if image is None else 3
+    handles, n_columns = legend_patches(values, colours, shown, table.names), 2 if image is None else 3
     beside = 1.1 + LETTER_INCHES * max(len(str(handle.get_label())) for handle in handles)
     figure = Figure(figsize=(n_columns * inches * width + beside, inches * sum(heights) + 0.6), layout="constrained")
     grid = figure.subplots(len(views), n_columns, squeeze=False, height_ratios=heights)
     for (left, right, *_), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
         left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
         if np.count_nonzero(shown) > LISTED_LABELS:
-            _write_numbers(left, view, numbers, colours, NUMBER_RADIUS_FRACTION * width)
+            _write_numbers(left, view, numbers, values, colours, NUMBER_RADIUS_FRACTION * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
         right.add_collection(
             PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
@@ -200,23 +202,24 @@ def _draw_interfaces(
 
 
 def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
-    """Count the labels 0 to n - 1 in all arrays together."""
+    """Count the rows of labels, 0 to n - 1, in all arrays together."""
     return np.bincount(np.concatenate([array.ravel() for array in arrays]), minlength=n)
 
 
 def _write_numbers(
-    axes: Axes, view: SliceView, pixels: NDArray[np.int64], colours: NDArray[np.float64], room: float
-) -> None:
+    axes: Axes, view: SliceView, pixels: NDArray[np.int64], values: NDArray[np.int64], colours: NDArray[np.float64],
+    room: float,
+) -> None:  # fmt: skip
     """Write the number of each label except 0 at its widest place in the slice, if a circle of `room` mm fits there."""
-    for label in np.unique(pixels[pixels > 0]):
+    for row in np.unique(pixels[values[pixels] > 0]):
         # The transform measures the distance to the nearest outside centre, half a pixel beyond the border.
-        depth = distance_transform_edt(np.pad(pixels == label, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
+        depth = distance_transform_edt(np.pad(pixels == row, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
         deepest = np.unravel_index(depth.argmax(), depth.shape)
         if depth[deepest] >= room:
-            is_dark = colours[label] @ (0.299, 0.587, 0.114) < 0.5
+            is_dark = colours[row] @ (0.299, 0.587, 0.114) < 0.5
             x, y = (np.array(deepest) + 0.5) * view.steps
             colour = "white" if is_dark else "black"
-            axes.text(x, y, f"{label}", color=colour, ha="center", va="center", fontsize=5)
+            axes.text(x, y, f"{values[row]}", color=colour, ha="center", va="center", fontsize=5)
 
 
 def boundary_figure(

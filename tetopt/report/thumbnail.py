@@ -94,7 +94,10 @@ def thumbnail_png(
     pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
     seen = [each[np.isfinite(each)] for each in pixels]
     limits = grey_limits([np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8)
-    colours = None if labels is None or of_cell is None else label_colours(labels, table.colours)
+    colours = None
+    if labels is not None and of_cell is not None:
+        values, row = np.unique(of_cell, return_inverse=True)
+        colours = np.where(of_cell[:, None] > 0, label_colours(values, table.colours)[row], np.nan)
     figure = Figure(figsize=(len(views), 1.0), dpi=SIDE_PIXELS, facecolor="black")
     for k, (place, axes) in enumerate(zip(places, views, strict=True)):
         panel = figure.add_axes((k / len(views), 0.0, 1.0 / len(views), 1.0))
@@ -107,7 +110,7 @@ def thumbnail_png(
             inside = np.nan_to_num(_sampled(mask, place, axes, half), nan=0.0)
             if inside.min() < 0.5 <= inside.max():
                 panel.contour(inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0)
-        _draw_mesh(panel, mesh, place, axes, colours, of_cell)
+        _draw_mesh(panel, mesh, place, axes, colours)
         panel.set_xlim(extent[:2])
         panel.set_ylim(extent[2:])
         if image.ndim == 3:
@@ -157,10 +160,9 @@ def _sampled(image: Image, place: NDArray[np.float64], axes: Sequence[int], half
 
 
 def _draw_mesh(
-    panel: Axes, mesh: Mesh, place: NDArray[np.float64], axes: Sequence[int], colours: NDArray[np.float64] | None,
-    of_cell: NDArray[np.int64] | None,
-) -> None:  # fmt: skip
-    """Draw the cells that the plane through a place cuts, and the mesh's boundary."""
+    panel: Axes, mesh: Mesh, place: NDArray[np.float64], axes: Sequence[int], colours: NDArray[np.float64] | None
+) -> None:
+    """Draw the cells that the plane through a place cuts, in their colours (M, 3) if any, and the mesh's boundary."""
     flat = list(axes)
     if len(place) == 2:
         corners, cells = mesh.points[mesh.cells], np.arange(len(mesh.cells))
@@ -174,9 +176,9 @@ def _draw_mesh(
         shared = facets(mesh.cells[cells]) if len(cells) else facets(mesh.cells)
         boundary, _ = triangle_cut(mesh.points, shared.nodes[shared.n_cells == 1], height)
     polygons = corners[..., flat]
-    if colours is not None and of_cell is not None:
-        is_shown = of_cell[cells] > 0
-        faces = np.column_stack([colours[of_cell[cells[is_shown]]], np.full(is_shown.sum(), LABEL_ALPHA)])
+    if colours is not None:
+        is_shown = np.isfinite(colours[cells, 0])
+        faces = np.column_stack([colours[cells[is_shown]], np.full(is_shown.sum(), LABEL_ALPHA)])
         panel.add_collection(PolyCollection(list(polygons[is_shown]), facecolors=faces, edgecolors="none"))
     width = min(0.25, EDGE_POINTS / np.sqrt(max(len(polygons), 1)))  # points
     panel.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tetopt.contents.labels import check_labels
+from tetopt.contents.labels import checked_labels
 from tetopt.contents.phantom import load_phantom
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
@@ -80,7 +80,7 @@ def reproduce(
     if tissue is None:
         note("the section on approximate segmentation is left out, as there are no `labels`")
     else:
-        check_labels("labels", tissue)
+        tissue = checked_labels("labels", tissue)
     paths = checked_outputs(results_folder(output), PAPER_FILES, force)
     about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     begin = time.perf_counter()
