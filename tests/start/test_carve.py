@@ -61,6 +61,11 @@ def test_what_a_mesh_tears_off_is_dropped_and_told():
     assert result.n_dropped == 1
     assert components(result.mesh.cells).max() == 0
     assert result.violated == {}
+    assert list(result.dropped) == [0]
+    assert 0.0 < result.dropped[0] < 56.0  # the bulb's voxels
+    labels = tetopt.Image(np.where(distance(image.shape, 10.5, 16.6, 24.5) < 2.3, 7.0, 3.0))
+    named = tetopt.mesh_image(content(image, labels, mask), 400, iterations=1)  # the bulb is a label of its own
+    assert (named.n_dropped, set(named.labels.tolist())) == (0, {3, 7})
     kept = tetopt.mesh_image(content(image, mask=mask, keep_components=True), 400, iterations=3)
     assert kept.n_dropped == 0
     assert components(kept.mesh.cells).max() == 1

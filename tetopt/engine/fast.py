@@ -11,6 +11,7 @@ nodes, k_D = 0.5), and E need not rise for it.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -185,6 +186,7 @@ def optimize(
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
     result = MeshingResult(run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped)
+    result = result._replace(dropped=dict(run.dropped))
     return checked(result, content, min_dihedral, mesh)
 
 
@@ -332,6 +334,7 @@ class Run:
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # positions at which nodes' flips were last evaluated
         self.hope = np.full(len(ticks), np.inf)  # expected gain of each node's next move, (N,); see `sweep`
         self.n_dropped = 0  # removed connected components that the mask does not have
+        self.dropped: Counter[int] = Counter()  # their volume by label, mm^n
 
     @property
     def is_still(self) -> NDArray[np.bool_]:
@@ -509,8 +512,10 @@ class Run:
                 is_flat = is_outer & (cell_cosines(self.state) < angle_limit_of(min_dihedral)[0])
                 if is_flat.sum() <= self.most_gone:
                     n_gone += self._take_out(is_flat)
-            kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
+            keeps, members = self.content.keeps_components, self.content.memberships
+            kept = carved(self.mesh(), self.image, self.content.region, keeps, members)
             n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
+            self.dropped.update(kept.volumes)
         if self.label_voxels is not None and self.content.memberships is not None:
             mend_pinches(self.state, self.image, self.content.memberships, self.mesh(), self.label_voxels)
         return n_gone

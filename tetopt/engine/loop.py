@@ -123,6 +123,8 @@ class MeshingResult(NamedTuple):
         Unexplained fraction of the content's variance: E_D over variance times volume. Only from `mesh_image`.
     n_dropped : int
         Connected components that were dropped, since the mask does not have them.
+    dropped : mapping of int to float
+        Volume of these components by label, mm^n; all of label 0 without labels.
     curving : Curving, optional
         For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the smooth level.
 
@@ -148,6 +150,7 @@ class MeshingResult(NamedTuple):
     fraction: float | None = None
     n_dropped: int = 0
     curving: Curving | None = None
+    dropped: Mapping[int, float] = MappingProxyType({})
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
         """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its labels, if any.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import time
+from collections import Counter
 from collections.abc import Callable
 from difflib import get_close_matches
 from math import prod
@@ -200,7 +201,7 @@ def mesh_image(
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> MeshingResult:
-        initial, n_dropped = (initial, 0) if mode == "start" else _carved(initial, content)
+        initial, n_dropped, dropped = (initial, 0, Counter()) if mode == "start" else _carved(initial, content)
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
         def optimized(**more: Any) -> MeshingResult:
@@ -213,7 +214,7 @@ def mesh_image(
         start_of_run = time.perf_counter()
         result = optimized() if watch is None else watch(initial, optimized)
         seconds.append(time.perf_counter() - start_of_run)
-        return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
+        return _with_dropped(result, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
 
     def begun(corners: int | None) -> Mesh:
         if mode == "graded":
@@ -248,12 +249,17 @@ def _curved(result: MeshingResult, content: Content) -> MeshingResult:
     return result._replace(mesh=mesh, curving=curving)
 
 
-def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:
-    """Carve an initial mesh within a mask; also return the number of dropped connected components."""
+def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) -> MeshingResult:
+    """Add components dropped from the initial mesh to those that a run dropped."""
+    return result._replace(n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped))
+
+
+def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int, Counter[int]]:
+    """Carve an initial mesh within a mask; also return the number and volumes of dropped components."""
     if content.region is None:
-        return initial, 0
-    carving = carved(initial, content.image, content.region, content.keeps_components)
-    return part_of(initial, carving.is_kept), carving.n_dropped
+        return initial, 0, Counter()
+    carving = carved(initial, content.image, content.region, content.keeps_components, content.memberships)
+    return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
 
 
 def bytes_of(content: Content, nodes: int) -> float:

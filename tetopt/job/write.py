@@ -161,6 +161,7 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
         measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * factor)
     if source.mask is not None:
         measures["dropped_components"] = lambda: result.n_dropped
+        measures["dropped_volumes"] = lambda: {str(label): volume for label, volume in result.dropped.items()}
     if (labels := result.labels) is not None:
         measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
     return measures

@@ -9,6 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import Region
+from tetopt.contents.memberships import Memberships
 from tetopt.geometry.manifold import manifold_part
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import compact, components
@@ -24,14 +25,17 @@ class Carved(NamedTuple):
 
     is_kept: NDArray[np.bool_]  # (M,)
     n_dropped: int  # dropped connected components
+    volumes: dict[int, float]  # mm^n of these, by label; all of label 0 without labels
 
 
-def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = False) -> Carved:
+def carved(
+    mesh: Mesh, image: Image, region: Region, keeps_components: bool = False, members: Memberships | None = None
+) -> Carved:
     """Select the cells of a mesh to keep, so that its boundary is a manifold and its components are the mask's.
 
     Cells at pinches of the boundary are dropped (`manifold_part`). Within each face-connected component of voxels, the
     largest connected component of cells stays, and those of a tenth of its volume or more; with `keeps_components`
-    all stay.
+    all stay. With labels, `members`, a component with most of a label's volume stays, too.
     """
     size = volumes(mesh.points, mesh.cells)
     is_kept = manifold_part(_welded(mesh), size)
@@ -39,14 +43,25 @@ def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = Fa
     number = components(mesh.cells[chosen])
     volume = np.bincount(number, size[chosen])
     if keeps_components or len(volume) < 2:
-        return Carved(is_kept, 0)
-    home = _home(mesh, chosen, number, size, image, region)
+        return Carved(is_kept, 0, {})
+    index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
+    voxel = tuple(np.clip(index, 0, np.array(image.shape) - 1).T)
+    home = _home(voxel, number, size[chosen], region)
     largest = np.zeros(home.max() + 1)
     np.maximum.at(largest, home, volume)
     is_dropped = (home == 0) | (volume < DROPPED_FRACTION * largest[home])
+    labels = np.zeros(1, dtype=np.int64) if members is None else members.labels
+    row = np.zeros(len(chosen), dtype=np.int64) if members is None else members.partition[voxel]
+    by_label = np.bincount(number * len(labels) + row, size[chosen], len(volume) * len(labels))
+    by_label = by_label.reshape(len(volume), len(labels))
+    if members is not None:
+        is_dropped &= ~(by_label > 0.5 * by_label.sum(axis=0)).any(axis=1)
     is_dropped[np.argmax(volume)] = False
     is_kept[chosen[is_dropped[number]]] = False
-    return Carved(is_kept, int(is_dropped.sum()))
+    lost = by_label[is_dropped].sum(axis=0)
+    return Carved(
+        is_kept, int(is_dropped.sum()), dict(zip(labels[lost > 0].tolist(), lost[lost > 0].tolist(), strict=True))
+    )
 
 
 def _welded(mesh: Mesh) -> NDArray[np.int64]:
@@ -72,14 +87,15 @@ def n_components(region: Region) -> int:
 
 
 def _home(
-    mesh: Mesh, chosen: NDArray[np.int64], number: NDArray[np.int64], size: NDArray[np.float64], image: Image,
-    region: Region,
-) -> NDArray[np.int64]:  # fmt: skip
-    """The component of voxels, from 1, that contains most of each component of the chosen cells, (C,); 0 for none."""
+    voxel: tuple[NDArray[np.int64], ...], number: NDArray[np.int64], size: NDArray[np.float64], region: Region
+) -> NDArray[np.int64]:
+    """The component of voxels, from 1, that contains most of each component of cells, (C,); 0 for none.
+
+    Cells have a `number` of their component, a size, and a voxel at their centroid.
+    """
     of_voxel, n_homes = scipy.ndimage.label(region.inside)
-    index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
-    at = of_voxel[tuple(np.clip(index, 0, np.array(image.shape) - 1).T)].astype(np.int64)
-    fractions = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
+    at = of_voxel[voxel].astype(np.int64)
+    fractions = scipy.sparse.coo_array((size, (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
     fractions = fractions[:, 1:]  # a component that lies partly outside has its home inside
     home = np.zeros(fractions.shape[0], dtype=np.int64)
     has_home = np.diff(fractions.indptr) > 0
