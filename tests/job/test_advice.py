@@ -9,7 +9,7 @@ from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.job.advice import agreed, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
-from tetopt.measure.fidelity import MaskFidelity
+from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.start.sizes import EdgeRatios, Sizes
 
 NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
@@ -70,6 +70,23 @@ def test_components_that_were_dropped_are_told(said):
     assert said() == ""
     assert told(*unmet({}, {"mask": NEAR, "dropped_components": 2})) == {}
     assert "dropped 2 connected components" in said()
+    volumes = {"mask": NEAR, "dropped_components": 2, "dropped_volumes": {"3": 1.5, "0": 2.0}}
+    told(*unmet({}, volumes))
+    assert "as large as 3.5 voxels; " in said()
+    told(*unmet({}, volumes | {"labels": [label_of(3)], "label_names": {3: "gland"}}))
+    assert "as large as 3.5 voxels (label 3 (gland) 1.5, label 0 2); " in said()
+
+
+def label_of(label, mesh_volume=9.0, is_lost=False):
+    return LabelFidelity(label, 9, 9.0, mesh_volume, 3, 0, 0.9, 0.9, 0.1, 0.1, 1, 1, is_lost)
+
+
+def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
+    rows = [label_of(k, volume) for k, volume in ((1, 9.0), (2, 18.5), (5, 2.0), (7, 17.9), (8, 4.6))]
+    told(*unmet({}, {"labels": [*rows, label_of(9, 0.0, True)]}))
+    (line,) = (line for line in said().splitlines() if "ratio" in line)
+    assert line.startswith("2 labels have more than 2 times the volume")
+    assert "(ratio in brackets): 5 (0.22), 2 (2.1); allow more nodes" in line
 
 
 def ended(E=0.5, E_D=0.5):

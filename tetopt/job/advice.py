@@ -21,6 +21,7 @@ from tetopt.model.labels import label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
+VOLUME_RATIO = 2.0  # of a label's cells to its voxels, or the other way round: more is reported
 LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represent the label
 NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
 ENERGY_RISE = 1e-3  # relative: E is reported if it ended higher above its least value
@@ -100,11 +101,23 @@ def unmet(requirements: Mapping[str, str], measured: dict[str, Any], word: str =
     yield from _of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
         text = f"dropped {n_dropped} connected components of the mesh that the {word} does not have"
-        yield Problem(text, "`keep_components` keeps them")
+        yield Problem(f"{text}{_dropped_words(measured)}", "`keep_components` keeps them")
+
+
+def _dropped_words(measured: dict[str, Any]) -> str:
+    """Describe the volume of dropped components, in voxels, by label if there are labels."""
+    mask, volumes = measured.get("mask"), measured.get("dropped_volumes")
+    if mask is None or not volumes:
+        return ""
+    voxels = {int(label): volume * mask.voxels / mask.volume for label, volume in volumes.items()}
+    names = measured.get("label_names", {})
+    rows = [f"label {label_words(label, names)} {size:.3g}" for label, size in voxels.items()]
+    of_labels = f" ({listed(rows)})" if measured.get("labels") else ""
+    return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
 def _lost(measured: dict[str, Any]) -> Iterator[Problem]:
-    """Yield labels of more than 200 voxels without a cell, smaller ones, and those of poor overlap."""
+    """Yield labels of more than 200 voxels without a cell, smaller ones, and those of poor volume or overlap."""
     labels = measured.get("labels", [])
     lost = [row for row in labels if row.is_lost]
     words = {row.label: label_words(row.label, measured.get("label_names", {})) for row in labels}
@@ -114,6 +127,12 @@ def _lost(measured: dict[str, Any]) -> Iterator[Problem]:
         yield Problem(text, "allow more nodes, or a higher `label_weight`", "labels", "smaller")
     if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
         yield Problem(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
+    ratios = {row.label: row.mesh_volume / row.volume for row in labels if not row.is_lost and row.mesh_volume > 0.0}
+    far = [label for label, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
+    if far := sorted(far, key=lambda label: -max(ratios[label], 1.0 / ratios[label])):
+        worst = ", ".join(f"{words[label]} ({ratios[label]:.2g})" for label in far)
+        text = f"{len(far)} labels have more than {VOLUME_RATIO:g} times the volume of their voxels, or less than half"
+        yield Problem(f"{text} (ratio in brackets): {worst}", "allow more nodes", wants="smaller")
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         text = f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: elements are too large, or this is "
