@@ -6,11 +6,13 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import content
+from tetopt.energy.discretization import combined
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, interface_energy, node_stars, remeasure
 from tetopt.engine.density import Limits, exchange
 from tetopt.engine.flips import flip
 from tetopt.engine.interfaces import relabel, with_labels
+from tetopt.engine.loop import GRADED_K_D
 from tetopt.engine.repair import repair
 from tetopt.engine.smooth import attract, blocks, star_tension, sweep
 from tetopt.engine.state import state_of, with_min_dihedral
@@ -237,6 +239,18 @@ def test_same_bits_on_any_number_of_threads(balls):
     np.testing.assert_array_equal(again.mesh.points, balls.mesh.points)
     np.testing.assert_array_equal(again.mesh.cells, balls.mesh.cells)
     np.testing.assert_array_equal(again.labels, balls.labels)
+
+
+@pytest.mark.full
+def test_E_of_the_history_is_comparable_throughout():
+    """Eq. (4) in every row, also where cells have labels, whose tension moves lower as well."""
+    phantom = tetopt.load_phantom("sphere")
+    what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
+    result = tetopt.mesh_image(what, 300, iterations=4)
+    first = result.history[0]
+    assert result.labels is not None
+    for row in result.history:
+        assert row.E == pytest.approx(combined(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9)
 
 
 def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):

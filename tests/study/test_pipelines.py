@@ -41,3 +41,10 @@ def test_the_other_pipelines_do_not_see_labels():
             PIPELINES[name].function(PipelineInput(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
         )
         assert with_labels.mesh.points.tobytes() == without.mesh.points.tobytes()
+
+
+def test_a_peer_that_is_not_installed_is_known_before_it_runs():
+    absent = PIPELINES["pytetwild"]._replace(packages=("no_such_package",))
+    assert absent.missing.startswith("pytetwild: not installed; install it with: pip install")
+    assert PIPELINES["tetopt"].missing is None
+    assert PIPELINES["bcc"]._replace(packages=("numpy",)).missing is None
