@@ -6,6 +6,7 @@ from commands import exit_code, numbers_in
 
 import tetopt
 from tetopt.model.file import MASK_TEXT
+from tetopt.report import figures
 
 pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
 LAW = "4 + 0.02*max(h,-190)"  # 0.2 in the air around, 10 to 26 in the organ
@@ -115,6 +116,52 @@ def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):
     np.testing.assert_array_equal(moduli(tmp_path / "a.vtu"), moduli(organ / "a.vtu"))
     assert numbers_in(tmp_path / "a.json")["mask"] == pytest.approx(numbers_in(organ / "a.json")["mask"])
     assert not (tmp_path / "boundary.png").exists()
+
+
+def test_numbers_are_of_the_voxels_that_are_meshed(organ, tmp_path):
+    """One unexplained variance, of the voxels in cells, and an image's properties without what is outside."""
+    numbers, fields = numbers_in(organ / "a.json"), tetopt.load_mesh(organ / "a.vtu").cell_data
+    h = np.float64(tetopt.load_image(organ / "ct.nii.gz").data)[tetopt.load_image(organ / "m.nii.gz").data > 0.0]
+    expected = {
+        "mean": h.mean(), "min": h.min(), "max": h.max(), "volume_mm": 1.5 * h.size,
+        "total_variation": 1.5 * h.size * h.var(),
+    }  # fmt: skip
+    assert {name: numbers["image_properties"][name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    assert numbers["image_properties"]["shape"] == [20, 18, 16]
+
+    def fraction(fields):
+        n, mean, variance = (fields[name] for name in ("n_voxels", "mean", "variance"))
+        within = (n * variance).sum()
+        return within / (within + (n * (mean - np.average(mean, weights=n)) ** 2).sum())
+
+    assert numbers["energies"]["E_D_fraction_of_variance"] == pytest.approx(fraction(fields), rel=1e-6)
+    words = ["--image", organ / "ct.nii.gz", "--json", tmp_path / "q.json", "--force"]
+    for mask in ([], ["--mask", organ / "m.nii.gz"]):
+        assert exit_code("quality", organ / "a.vtu", *words, *mask) in (0, 1)
+        assert numbers_in(tmp_path / "q.json")["fit"]["E_D_fraction_of_variance"] == pytest.approx(
+            numbers["energies"]["E_D_fraction_of_variance"], rel=1e-9
+        )
+    bare = tetopt.load_mesh(organ / "a.vtu").mesh
+    tetopt.save_mesh(tmp_path / "bare.vtu", bare)  # knows of no mask
+    assert exit_code("quality", tmp_path / "bare.vtu", *words) in (0, 1)
+    of_all = tetopt.cell_fields(bare, tetopt.load_image(organ / "ct.nii.gz"))
+    assert numbers_in(tmp_path / "q.json")["fit"]["E_D_fraction_of_variance"] == pytest.approx(
+        fraction(of_all), rel=1e-6
+    )
+
+
+def test_pictures_have_the_grey_window_of_the_voxels_in_the_mask(organ):
+    image, mask = (tetopt.load_image(organ / f"{name}.nii.gz") for name in ("ct", "m"))
+    mesh, affine = tetopt.load_mesh(organ / "a.vtu").mesh, image.affine.copy()
+    affine[2, 3] -= 24 * 1.5
+    beyond = ((0, 0), (0, 0), (24, 0))
+    moved = (tetopt.Image(np.pad(each.data, beyond, mode="edge"), affine) for each in (image, mask))
+    for whole, inside in ((image, mask), moved):  # in the second, the middle slice is all air
+        view = figures.slice_figure(whole, [("", mesh)], mask=inside).axes[0]
+        low, high = view.images[0].get_clim()
+        assert 0.0 < low < 300.0
+        assert high > 1100.0
+        assert view.collections[0].get_paths()
 
 
 @pytest.mark.parametrize("command", ["quality", "fem", "segment", "view", "convert"])

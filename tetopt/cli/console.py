@@ -215,7 +215,7 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", ever
         print_line(sizes_in_words(measured["edges_over_target"]))
     for row in measured.get("contrasts", []):
         fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
-        print_line(f"{row['image']}: weight {row['weight']:g}, unexplained variance {fraction}")
+        print_line(f"{row['image']}: weight {row['weight']:g}, unexplained variance of this image {fraction}")
     if "mask" in measured:
         print_table(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:

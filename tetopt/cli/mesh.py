@@ -69,12 +69,12 @@ def _print(result: Result) -> None:
 
 def _print_comparison(result: Result, n_empty: int) -> None:
     content, order = result.task.source.content, result.model.order
-    first, last = result.optimized.history[0], result.optimized.history[-1]
+    first = result.optimized.history[0]
     table = new_table("", result.task.start_name, "optimised")
-    if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
-        table.add_row(
-            f"E_D, fraction of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
-        )
+    names = ("E_D_fraction_of_variance_initial", "E_D_fraction_of_variance")
+    left = [result.numbers["energies"][name] for name in names]
+    if first.E_D > 0.0 and None not in left:
+        table.add_row(f"E_D, fraction of {whose_variance(content)}", *(f"{fraction:.5f}" for fraction in left))
     meshes = (result.meshed.initial, result.mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     first_shape, last_shape = result.shapes

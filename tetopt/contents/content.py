@@ -177,10 +177,13 @@ class Content(NamedTuple):
 
     @property
     def spread(self) -> Spread:
-        """Spread of the image's intensities over all of its voxels."""
+        """Spread of the first contrast's intensities over its own voxels to cover."""
         if self.statistics is not None:
             return Spread(*self.statistics[:4])
-        return Spread(self.image.mean, *self.image.range, self.image.variance)
+        if self.continuation is None:
+            return Spread(self.given.mean, *self.given.range, self.given.variance)
+        h = self.own.data[self.continuation.inside]
+        return Spread(float(h.mean(dtype=np.float64)), float(h.min()), float(h.max()), _variance(h, None))
 
     @property
     def wrong_side(self) -> float:

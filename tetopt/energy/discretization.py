@@ -70,6 +70,42 @@ def E_D(image: Image, mesh: Mesh) -> float:
     return float(cell_E_D(image, mesh).sum())
 
 
+def unexplained(content: Content, mesh: Mesh) -> float | None:
+    """Return the unexplained variance: the fraction of the variance of the voxels in cells that is left within cells.
+
+    It is over all channels, from 0 to 1. Unlike E_D it has no penalty for voxels on the wrong side of a mask's surface.
+    None if these voxels are equal, or if there are none.
+
+    Raises
+    ------
+    InputError
+        As for `tetopt.energy.sampling.cell_moments`.
+    """
+    sums, within = _channel_sums(content, mesh)
+    count = np.maximum(sums[:, :1], 1.0)
+    means = sums[:, _columns(content)] / count
+    weights = np.where(sums[:, :1] > 0.0, count, 0.0)
+    middle = (weights * means).sum(axis=0) / max(float(weights.sum()), 1.0)
+    between = float((weights * (means - middle) ** 2).sum())
+    left = float(within.sum())
+    return left / (left + between) if left + between > 0.0 else None
+
+
+def _columns(content: Content) -> list[int]:
+    """Return the columns of `moment_sums` with the sums of the channels' values."""
+    return [1, *range(3, 2 + len(content.values))]
+
+
+def _channel_sums(content: Content, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the sums over each cell (M, D), see `moment_sums`, and its sum of squares about its means (M,)."""
+    grid = channel_grid(content, mesh.points)
+    ticks = to_ticks(content.image.to_index(mesh.points), grid)
+    check_orientations(content.image, ticks, mesh.cells)
+    sums = moment_sums(grid, ticks, mesh.cells)
+    squares = sums[:, 2] - (sums[:, _columns(content)] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    return sums, np.where(sums[:, 0] > 0.0, np.maximum(squares, 0.0), 0.0)
+
+
 def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     """E_D of a mesh over all channels of a content, intensity^2 mm^n, and the number of voxels in its cells.
 
@@ -81,13 +117,8 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     InputError
         As for `tetopt.energy.sampling.cell_moments`.
     """
-    grid = channel_grid(content, mesh.points)
-    ticks = to_ticks(content.image.to_index(mesh.points), grid)
-    check_orientations(content.image, ticks, mesh.cells)
-    sums = moment_sums(grid, ticks, mesh.cells)
-    means = sums[:, [1, *range(3, 2 + len(content.values))]]
-    within = sums[:, 2] - (means**2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
-    squares = float(np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0).sum())
+    sums, within = _channel_sums(content, mesh)
+    squares = float(within.sum())
     if content.region is not None:  # the last column: voxels outside minus voxels inside
         squares += content.wrong_side * (content.n_voxels + int(sums[:, -1].sum()))
     return squares * content.unit * content.image.voxel_volume, int(sums[:, 0].sum())

@@ -35,7 +35,7 @@ from tetopt.engine.loop import (
     MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.requirements import requested
+from tetopt.engine.requirements import requested, unexplained_by
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -434,7 +434,7 @@ def meshed_to_error(
         if _is_repeated(runs, initial, nodes):
             break
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
-        count, fraction = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
+        count, fraction = len(result.mesh.points), unexplained_by(content, result.mesh, result.history[-1])
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:
             is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(target_error, fraction)

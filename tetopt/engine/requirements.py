@@ -14,8 +14,9 @@ import numpy as np
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import Region
+from tetopt.energy.discretization import unexplained
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.loop import MeshingResult
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
@@ -114,7 +115,7 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
     the image's box (`is_filled`).
     """
     violated = dict(result.violated)
-    fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+    fraction = unexplained_by(content, result.mesh, result.history[-1])
     if target_error is not None and fraction > target_error:
         violated["error"] = (
             f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}; allow smaller "
@@ -122,6 +123,13 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
         )
     violated |= _uncovered(content.image, result) if is_filled else {}
     return result._replace(violated=violated, fraction=fraction)
+
+
+def unexplained_by(content: Content, mesh: Mesh, record: IterationRecord) -> float:
+    """Return the unexplained variance of a mesh with this record, `tetopt.energy.discretization.unexplained`; or 0."""
+    if content.region is None and record.n_voxels == content.n_voxels:  # also if the voxels stay in their file
+        return record.E_D / (content.variance * content.volume or 1.0)
+    return unexplained(content, mesh) or 0.0
 
 
 def _uncovered(image: Image, result: MeshingResult) -> dict[str, str]:

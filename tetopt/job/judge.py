@@ -176,7 +176,7 @@ def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
     if not came.is_compared:
         measured.pop("mask", None)
-    if not (source.content.is_plain and source.content.region is None):
+    if not source.content.is_plain:
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
     return fit, result, measured
 

@@ -27,6 +27,7 @@ from tetopt.engine.meshing import (
     check_memory_of,
     mesh_image,
 )
+from tetopt.engine.requirements import unexplained_by
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
@@ -192,7 +193,7 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
-        fraction = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+        fraction = unexplained_by(content, result.mesh, result.history[-1])
         note(
             f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance unexplained; "
             f"accepted: {ERROR_REACHED * target:.4g} to {target:.4g}"

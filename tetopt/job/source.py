@@ -38,7 +38,7 @@ from tetopt.job.inputs import (
 )
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
-from tetopt.measure.fidelity import cell_labels
+from tetopt.measure.fidelity import cell_labels, unexplained_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
@@ -66,11 +66,6 @@ class Source(NamedTuple):
         return continued(self.contrasts[0], self.content.continuation)
 
     @property
-    def own(self) -> Content:
-        """The first contrast alone, on its own voxels; `content` may have divided voxels, and has more channels."""
-        return Content(self.image, statistics=self.content.statistics)
-
-    @property
     def mask_word(self) -> str:
         """The name of the meshed region in messages."""
         return "mask" if self.about["inputs"]["background"] is None else "foreground"
@@ -78,7 +73,7 @@ class Source(NamedTuple):
     @property
     def low(self) -> float:
         """The least intensity."""
-        return self.own.spread.low
+        return self.content.spread.low
 
     @property
     def is_constant(self) -> bool:
@@ -111,10 +106,7 @@ class Source(NamedTuple):
         rows = []
         for number, (path, weight) in enumerate(zip(self.paths, self.weights, strict=True), 1):
             mean, variance = (fields[field if number == 1 else f"{field}_{number}"] for field in ("mean", "variance"))
-            count = fields["n_voxels"]
-            within = float((count * variance).sum())
-            total = within + float((count * (mean - (count * mean).sum() / count.sum()) ** 2).sum())
-            fraction = within / total if total > 0.0 else None
+            fraction = unexplained_of(fields["n_voxels"], mean, variance)
             rows.append({"image": path.name, "weight": weight, "E_D_fraction_of_variance": fraction})
         return rows
 

@@ -35,7 +35,7 @@ from tetopt.model.file import MASK_TEXT
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
-from tetopt.report.summary import fidelity, image_summary, measured_each, run_summary
+from tetopt.report.summary import fidelity, measured_each, run_summary
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes
@@ -136,7 +136,6 @@ def numbers_of(
     texts = {name: text for name, text in about.items() if name != MASK_TEXT}  # which is for the mesh's file
     texts |= {} if table is None else {TABLE_TEXT: table_words(table)}
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
-    summary["image_properties"] = image_summary(source.own)  # on original voxels, not on divided ones
     summary["request"] = task.request
     if task.by_label is not None:
         made = task.by_label
@@ -153,7 +152,7 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     has_image = "n_voxels" in fields
     if has_image:
         measures["cells_without_voxel"] = lambda: int((fields["n_voxels"] == 0).sum())
-    if has_image and not (source.content.is_plain and source.content.region is None):
+    if has_image and not source.content.is_plain:
         measures["contrasts"] = lambda: source.by_contrast(fields)
     if sizes is not None and sizes.has_target:
         content, factor = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
@@ -174,7 +173,7 @@ def draw(task: Task, came: Meshed, model: Model) -> None:
     pictures, mesh, source = task.plan.pictures, came.result.mesh, task.source
     image = source.drawn
     own = continued(image, source.content.continuation)
-    figures.save_run_figures(pictures[:3], own, came.initial, came.result, task.start_name, image)
+    figures.save_run_figures(pictures[:3], own, came.initial, came.result, task.start_name, image, source.mask)
     of_cell = model.cell_data.get("label")
     if source.mask is not None and "boundary" in pictures[3].stem:  # none for the mask of a mesh to start from
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])

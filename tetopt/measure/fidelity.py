@@ -631,11 +631,18 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
         The mesh contains no voxel centre.
     """
     moments = cell_moments(image, mesh)
-    E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
-    n_voxels = int(moments.n_voxels.sum())
+    E_D, n_voxels = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume, int(moments.n_voxels.sum())
     if n_voxels == 0:
         raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
-    mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
-    spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
     n_empty = int((moments.n_voxels == 0).sum())
-    return ImageFit(E_D, E_D / spread if spread > 0.0 else None, n_voxels, n_empty, overlap_of(image, mesh))
+    return ImageFit(E_D, unexplained_of(*moments), n_voxels, n_empty, overlap_of(image, mesh))
+
+
+def unexplained_of(
+    n_voxels: NDArray[np.int64], mean: NDArray[np.float64], variance: NDArray[np.float64]
+) -> float | None:
+    """Return the fraction of the variance of the voxels in cells that is left within cells; None if they are equal."""
+    within = float((n_voxels * variance).sum())
+    middle = float((n_voxels * mean).sum()) / max(int(n_voxels.sum()), 1)
+    total = within + float((n_voxels * (mean - middle) ** 2).sum())
+    return within / total if total > 0.0 else None

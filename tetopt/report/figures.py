@@ -15,7 +15,8 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from tetopt.energy.sampling import cell_moments
+from tetopt.contents.domain import INSIDE_FRACTION
+from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
@@ -52,7 +53,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 
 def save_run_figures(
     paths: Sequence[Path], image: Image, initial: Mesh, result: MeshingResult, start: str = "lattice",
-    whole: Image | None = None,
+    whole: Image | None = None, mask: Image | None = None,
 ) -> None:  # fmt: skip
     """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
 
@@ -64,25 +65,26 @@ def save_run_figures(
     before = f"{start}, {len(initial.points)} nodes"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
-    save_figure(slice_figure(image if whole is None else whole, meshes, means_of=image), paths[0])
+    save_figure(slice_figure(image if whole is None else whole, meshes, means_of=image, mask=mask), paths[0])
     save_figure(histogram_figure(meshes), paths[1])
     save_figure(energy_figure(result.history), paths[2])
 
 
 def slice_figure(
     image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None,
-    means_of: Image | None = None,
+    means_of: Image | None = None, mask: Image | None = None,
 ) -> Figure:  # fmt: skip
     """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell.
 
     `axis` and `index` choose the slice in voxel indices; by default it is the middle slice across the axis nearest to
-    the world's z (an axial slice). A 2-D image is shown whole. The means are those of `means_of`, by default of the
-    image itself. In their row, parts of the image that a mesh does not cover are light blue.
+    the world's z (an axial slice), or the mesh's middle one if the mesh does not reach it. A 2-D image is shown whole.
+    Black and white are those of the voxels in the last mesh and its mask. The means are those of `means_of`, by default
+    of the image itself. In their row, parts of the image that a mesh does not cover are light blue.
     """
-    view = SliceView(image, axis, index)
+    view = SliceView(image, axis, _slice_through(meshes[-1][1], image, axis) if index is None else index)
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
-    limits = grey_limits([view.pixels], brightest=99.8)
+    limits = limits_within(image, meshes[-1][1], [view], mask)
     for column, (title, mesh) in enumerate(meshes):
         polygons, cells = view.section(mesh)
         over, flat = grid[:, column]
@@ -95,6 +97,32 @@ def slice_figure(
         for axes in (over, flat):
             view.frame(axes)
     return figure
+
+
+def _slice_through(mesh: Mesh, image: Image, axis: int | None) -> int | None:
+    """Return the index of the middle slice of a mesh that does not reach the image's middle one; None otherwise."""
+    if image.ndim == 2:
+        return None
+    across = world_axes(image.affine).index(2) if axis is None else axis
+    along, last = image.to_index(mesh.points)[:, across], image.shape[across] - 1
+    if along.min() <= image.shape[across] // 2 <= along.max():
+        return None
+    return int(np.clip(np.rint(0.5 * (along.min() + along.max())), 0, last))
+
+
+def limits_within(
+    image: Image, mesh: Mesh, views: Sequence[SliceView], mask: Image | None = None
+) -> tuple[float, float]:
+    """Return the values drawn black and white in views of an image: those of the voxels in the mesh and its mask."""
+    inside = cell_of_voxel(image, mesh) >= 0
+    inside &= True if mask is None else mask.data >= INSIDE_FRACTION
+    pixels = [view.pixels for view in views]
+    if not inside.all():
+        covered = Image(inside, image.affine)
+        pixels = [view.pixels[SliceView(covered, view.across, view.index).pixels > 0.0] for view in views]
+    if sum(map(np.size, pixels)) == 0:
+        pixels = [image.data[inside] if inside.any() else image.data]
+    return grey_limits(pixels, brightest=99.8)
 
 
 def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
@@ -189,7 +217,7 @@ def _draw_interfaces(
 ) -> None:
     """Draw the middle slices of the image, and over them the sections of interfaces between the cells' labels."""
     views = _middle_views(image)
-    limits = grey_limits([view.pixels for view in views], brightest=99.8)
+    limits = limits_within(image, mesh, views)
     n_cells = np.bincount(of_cell, minlength=len(colours))
     for axes, view in zip(column, views, strict=True):
         lines, sides = view.interfaces(mesh, of_cell)
@@ -261,7 +289,7 @@ def boundary_figure(
     low, high = _longest_part(outline, view)
     figure = Figure(figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained")
     whole, detail = figure.subplots(1, 2, width_ratios=(1.0, view.aspect))
-    limits = grey_limits([view.pixels], brightest=99.8)
+    limits = limits_within(image, mesh, [view], mask)
     for axes, width in ((whole, 0.7), (detail, 1.8)):
         view.show_pixels(axes, limits)
         view.frame(axes)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, content, continued, plain
 from tetopt.engine.loop import MeshingResult
+from tetopt.engine.requirements import unexplained_by
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -47,8 +48,13 @@ def mesh_hash(mesh: Mesh) -> str:
 
 
 def image_summary(image: Image | Content) -> dict[str, Any]:
-    """Return shape, position and spread of an image; `total_variation` is E_D of a single cell around it."""
-    grid, (mean, low, high, variance) = plain(image).image, plain(image).spread
+    """Return shape and position of an image, and the spread and volume of its voxels to cover.
+
+    `total_variation` is E_D of a single cell around these voxels.
+    """
+    what = plain(image)
+    grid, (mean, low, high, variance) = what.given, what.spread
+    volume = grid.volume if what.continuation is None else what.continuation.inside.sum() * grid.voxel_volume
     return {
         "shape": grid.shape,
         "spacing_mm": grid.spacing,
@@ -56,8 +62,8 @@ def image_summary(image: Image | Content) -> dict[str, Any]:
         "min": low,
         "max": high,
         "mean": mean,
-        "volume_mm": grid.volume,
-        "total_variation": variance * grid.volume,
+        "volume_mm": float(volume),
+        "total_variation": variance * float(volume),
     }
 
 
@@ -73,7 +79,9 @@ def run_summary(
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
     first, last = result.history[0], result.history[-1]
     own = plain(image)
-    spread = own.variance * own.volume
+    is_varied = own.variance > 0.0
+    fractions = (unexplained_by(own, mesh, row) for mesh, row in ((result.mesh, last), (initial, first)))
+    left, left_first = (fraction if is_varied else None for fraction in fractions)
     return {
         **about,
         "versions": versions(),
@@ -85,8 +93,8 @@ def run_summary(
             "E": last.E,
             "E_G_relative": last.E_G / first.E_G,
             "E_D_relative": last.E_D / first.E_D if first.E_D > 0.0 else None,
-            "E_D_fraction_of_variance": last.E_D / spread if spread > 0.0 else None,
-            "E_D_fraction_of_variance_initial": first.E_D / spread if spread > 0.0 else None,
+            "E_D_fraction_of_variance": left,
+            "E_D_fraction_of_variance_initial": left_first,
         },
         "quality_initial": shapes[0],
         "quality": shapes[1],

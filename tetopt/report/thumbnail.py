@@ -19,6 +19,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from tetopt.contents.domain import INSIDE_FRACTION
+from tetopt.energy.sampling import cell_of_voxel
 from tetopt.geometry.cut import plane_cut, triangle_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
@@ -92,7 +94,10 @@ def thumbnail_png(
     if image.ndim == 3:
         places = [_at(place, axis, _fullest(mesh, axis)) for place, axis in zip(places, (2, 0), strict=True)]
     pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
-    seen = [each[np.isfinite(each)] for each in pixels]
+    inside = cell_of_voxel(image, mesh) >= 0
+    covered = Image(inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine)
+    is_in = [_sampled(covered, place, axes, half) > 0.5 for place, axes in zip(places, views, strict=True)]
+    seen = [each[np.isfinite(each) & within] for each, within in zip(pixels, is_in, strict=True)]
     limits = grey_limits([np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8)
     colours = None
     if labels is not None and of_cell is not None:

@@ -34,7 +34,7 @@ from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
-from tetopt.measure.fidelity import cell_labels, label_fidelity
+from tetopt.measure.fidelity import cell_labels, label_fidelity, unexplained_of
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.measure.thin import contact_totals, label_contacts
@@ -42,7 +42,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.mappings import ModulusMapping
-from tetopt.report.summary import image_summary, versions
+from tetopt.report.summary import versions
 from tetopt.study import compare_report as records
 from tetopt.study.child import run_in_child
 from tetopt.study.compare_report import Attempt, Measurement, Report, Settings, as_json, averages_of, from_json
@@ -193,7 +193,6 @@ def measured(
     image = standard.image
     moments = cell_moments(image, mesh)
     owner = cell_of_voxel(image, mesh)
-    total = image_summary(image)["total_variation"]
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     fraction, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
     angles, angle_edges = np.histogram(dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0))
@@ -209,7 +208,7 @@ def measured(
         n_corners=len(mesh.points),
         n_cells=len(mesh.cells),
         E_D=E_D,
-        E_D_fraction=E_D / total if total > 0.0 else None,
+        E_D_fraction=unexplained_of(*moments),
         n_missed_voxels=int((owner < 0).sum()),
         n_empty_cells=int((moments.n_voxels == 0).sum()),
         quality=quality(mesh.points, mesh.cells),
@@ -236,7 +235,7 @@ def _label_rows(
     painted = np.where(owner >= 0, of_cell[owner], 0)
     h = standard.image.data.ravel().astype(np.float64)
     squares = np.bincount(place, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
-    total = float(((h - h.mean()) ** 2).sum())
+    total = float(np.var(h[owner.ravel() >= 0])) * np.count_nonzero(owner >= 0)
     contacts = label_contacts(standard.labels, mesh, of_cell)
     return [
         records.LabelRow(
