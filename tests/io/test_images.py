@@ -582,7 +582,8 @@ def test_frames_of_a_tiff(tmp_path):
     frames[0].save(path, save_all=True, append_images=frames[1:])
     for k in range(3):
         np.testing.assert_array_equal(load_image(path, volume=k).data, ramp(3, 5) + k)
-    assert_refused(path, "has 3 volumes; .*`volume=k`")
+    pytest.importorskip("tifffile")
+    assert_refused(path, "this stack of 3 slices states no voxel size")
     assert_refused(path, "got 3: the file has 3 volumes", volume=3)
 
 

@@ -30,10 +30,11 @@ from tetopt.image import Image
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
-from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
+from tetopt.io.pictures import PICTURE_SUFFIXES
 from tetopt.io.read_dicom import DICOM_SUFFIX, is_dicom, read_dicom
 from tetopt.io.read_itk import ITK_READERS, read_itk
 from tetopt.io.readback import save_checked
+from tetopt.io.stacks import check_spacing, read_pictures, read_slices, slice_files
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import (
     DAMAGED_FILE,
@@ -73,11 +74,13 @@ def load_image(
     volume: int | None = None,
     slice_: tuple[int, int] | None = None,
     crop: Bounds | None = None,
+    spacing_mm: float | Sequence[float] | None = None,
 ) -> Image:
     """Read an image from a file, or from a folder of Zarr or of DICOM slices, in RAS+ millimetres.
 
     The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra ``tetopt[itk]``)
-    reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads 2-D pictures; zarr
+    reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads 2-D pictures and folders with one of
+    them per slice, tifffile (``tetopt[tiff]``) TIFF stacks with the calibration of ImageJ or OME; zarr
     (``tetopt[blocks]``) reads OME-Zarr and Zarr arrays, and only the requested part;
     `tetopt.io.stored_images.open_stored` describes their placement. Axes of length 1 beyond the third are dropped.
 
@@ -99,6 +102,9 @@ def load_image(
     crop : sequence of (start, stop), optional
         Keep a box of voxels, see `cropped`; one range per axis of the volume.
         Both `slice_` and `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
+    spacing_mm : float or sequence of float, optional
+        Voxel sizes, mm, of a TIFF stack or a folder of slices that states none, one number or one per axis (column,
+        row, slice); or the pixel size of a picture, by default 1 mm.
 
     Returns
     -------
@@ -111,7 +117,8 @@ def load_image(
         ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
         a library is needed and not installed; a folder has no DICOM series or several; DICOM slices or frames are not
         parallel, evenly spaced and one per position, or do not state where they lie; `open_stored`
-        rejects a Zarr folder; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
+        rejects a Zarr folder; a stack states no voxel size, or another than `spacing_mm`; slices are missing or
+        differ; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
         invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
 
     Warns
@@ -144,9 +151,10 @@ def load_image(
             is_stored = is_zarr(path)
         if is_stored:
             whole = open_zarr(zarr_levels(path, notes)[0], volume)
+            check_spacing(spacing_mm, whole.spacing)
             image = _part_of_stored(whole, slice_, crop, notes)
         else:
-            image = part_of(Image(*_read(path, volume, notes)), slice_, crop)
+            image = part_of(Image(*_read(path, volume, notes, spacing_mm)), slice_, crop)
     except InputError as error:
         raise named_error(path, error) from error
     for note in notes:
@@ -448,8 +456,28 @@ def _raised(error: OSError) -> None:
 # Choice of the reader
 
 
-def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def _read(
+    path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
+) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
     """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to `notes`."""
+    with os_errors_named():
+        if path.is_dir() and (names := slice_files(path)):
+            return read_slices(path, names, notes, spacing_mm)
+    if path.name.lower().endswith(PICTURE_SUFFIXES):
+        check_beginning(path)
+        return read_pictures(path, volume, notes, spacing_mm)
+    data, affine = _read_placed(path, volume, notes)
+    check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
+    return data, affine
+
+
+def has_own_spacing(path: Path) -> bool:
+    """Return whether a file's format states voxel sizes: all do but pictures, stacks and folders of slices."""
+    with os_errors_named(path):
+        return not (slice_files(path) if path.is_dir() else path.name.lower().endswith(PICTURE_SUFFIXES))
+
+
+def _read_placed(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     with os_errors_named():
         if path.is_dir():
             return read_dicom(path, volume, notes)
@@ -459,8 +487,8 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
             return read(path, volume, notes)
     if is_dicom(path):  # scanners name files without a suffix
         return read_dicom(path, volume, notes)
-    known = ", ".join((*READERS, ZARR_SUFFIX))
-    raise InputError(f"unknown image format; expected {known}, or a folder of DICOM files")
+    known = ", ".join((*READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
+    raise InputError(f"unknown image format; expected {known}, or a folder of DICOM files or of slices")
 
 
 def check_beginning(path: Path) -> str:
@@ -517,7 +545,6 @@ READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArra
     **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
     **dict.fromkeys(ITK_READERS, read_itk),
     DICOM_SUFFIX: read_dicom,
-    **dict.fromkeys(PICTURE_SUFFIXES, read_picture),
 }
 
 

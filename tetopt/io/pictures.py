@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.volumes import UNREADABLE_FILE, volume_index
+from tetopt.system.extras import install_hint
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 # Pillow goes by content, not by name; only these formats are tried (for PostScript it would start Ghostscript).
@@ -19,14 +20,15 @@ MOST_PIXELS = 2**30  # in a frame: 32,768 squared, more than any slide scanner's
 
 def read_picture(path: Path, volume: int | None, _notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Return grey values (rows, columns) and affine of a frame; InputError without a leading path."""
-    data = read_apart(_pixels_of, path, volume, value_bytes=MOST_PIXELS, library="Pillow")
+    data = read_apart(frame_of, path, volume, value_bytes=MOST_PIXELS, library="Pillow")
     return data, np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, data.shape[0] - 1.0], [0.0, 0.0, 1.0]])
 
 
 # In the child
 
 
-def _pixels_of(path: str, volume: int | None) -> NDArray:
+def frame_of(path: str, volume: int | None) -> NDArray:
+    """Return the grey values (rows, columns) of a picture's frame; in a child process."""
     import PIL.Image
 
     PIL.Image.MAX_IMAGE_PIXELS = None  # replaced by our limit, as Pillow's first causes a warning and then an error
@@ -35,7 +37,11 @@ def _pixels_of(path: str, volume: int | None) -> NDArray:
     except PIL.UnidentifiedImageError as error:
         raise InputError(f"{UNREADABLE_FILE} (unknown to Pillow)") from error
     with picture:
-        (frame,) = volume_index((getattr(picture, "n_frames", 1),), volume)
+        n_frames = getattr(picture, "n_frames", 1)
+        if volume is None and n_frames > 1 and picture.format == "TIFF":
+            hint = install_hint("tiff", "tifffile")
+            raise InputError(f"it has {n_frames} pages; choose one by `volume`, or read stacks with tifffile: {hint}")
+        (frame,) = volume_index((n_frames,), volume)
         picture.seek(frame)
         width, height = picture.size
         if width * height > MOST_PIXELS:

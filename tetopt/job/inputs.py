@@ -31,9 +31,10 @@ from tetopt.contents.labels import checked_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice, part_of, sha256
+from tetopt.io.images import file_shape, has_own_spacing, load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
 from tetopt.io.meshes import load_mesh
+from tetopt.io.stacks import parse_spacing
 from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
@@ -60,6 +61,7 @@ def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
         volume=part.volume,
         slice_=None if slice_ is None else parse_slice(slice_),
         crop=None if part.crop is None else parse_crop(part.crop),
+        spacing_mm=None if part.spacing_mm is None else parse_spacing(part.spacing_mm),
     )
 
 
@@ -101,9 +103,9 @@ def image_and_others(path: Path, part: ImagePart, finest: Sequence[Path | None] 
     image = read_image(path, part)
     # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
     slice_ = None if part.slice_ is None else parse_slice(part.slice_)
-    whole = coarse = image if slice_ is None else read_image(path, ImagePart(volume=part.volume))
+    whole = coarse = image if slice_ is None else read_image(path, replace(part, slice_=None, crop=None))
     crop = None if part.crop is None else parse_crop(part.crop)
-    originals = {other: read_companion(other) for other in finest if other is not None}
+    originals = {other: read_companion(other, part.spacing_mm) for other in finest if other is not None}
     factors = _divisions(whole, originals, None if slice_ is None else slice_[0])
     if max(factors) > 1:
         whole = divided(whole, factors)
@@ -115,7 +117,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Sequence[Path | None] 
         image = whole if slice_ is None else part_of(whole, slice_, crop)
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        original = originals[other] if other in originals else read_companion(other)
+        original = originals[other] if other in originals else read_companion(other, part.spacing_mm)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
         moved = aligned(original, grid, str(other))
@@ -174,12 +176,16 @@ def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bo
         )
 
 
-def read_companion(path: Path) -> Image:
-    """Read another file with the image, without the warning for a constant image, which sizes or a mask may be."""
+def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
+    """Read another file with the image, without the warning for a constant image, which sizes or a mask may be.
+
+    Voxel sizes are for a stack or folder of slices; files of other formats have their own.
+    """
     file, volume = file_and_volume(path)
+    spacing = None if spacing_mm is None or has_own_spacing(file) else parse_spacing(spacing_mm)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "(?s).* everywhere, so E_D is 0")
-        return load_image(file, volume=volume)
+        return load_image(file, volume=volume, spacing_mm=spacing)
 
 
 def file_and_volume(path: Path) -> tuple[Path, int | None]:
@@ -291,7 +297,7 @@ def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshF
     return Content(continued(whole, beyond), continuation=beyond, whole=whole)
 
 
-def with_labels(loaded: MeshFile, path: Path | None, options: MaskPart) -> MeshFile:
+def with_labels(loaded: MeshFile, path: Path | None, options: LabelledPart) -> MeshFile:
     """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
     if path is None:
         return loaded
@@ -300,7 +306,7 @@ def with_labels(loaded: MeshFile, path: Path | None, options: MaskPart) -> MeshF
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        return aligned(read_companion(other), labels, str(other))
+        return aligned(read_companion(other, options.spacing_mm), labels, str(other))
 
     try:
         counted = continued(labels, mask_for(options, labels, beside, loaded))

@@ -150,10 +150,10 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
     )  # fmt: skip
-    return read_source(options, numbers=None if labels is None else _merged(inputs, labels), loaded=loaded)
+    return read_source(options, numbers=None if labels is None else _merged(inputs, labels, part), loaded=loaded)
 
 
-def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
+def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:
     """Return the numbers that the mesh's run gave to merged labels; none if the labels have them already."""
     table, sums = inputs.get("merged"), inputs.get("sha256")
     numbers = {
@@ -163,7 +163,7 @@ def _merged(inputs: Mapping[str, Any], labels: Path) -> dict[int, int]:
     }
     if not numbers or (isinstance(sums, dict) and sums.get(labels.name) == checksum(labels)):
         return numbers
-    return {} if np.isin(read_companion(labels).data, list(numbers.values())).all() else numbers
+    return {} if np.isin(read_companion(labels, part.spacing_mm).data, list(numbers.values())).all() else numbers
 
 
 def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:

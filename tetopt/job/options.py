@@ -46,7 +46,9 @@ class Option(NamedTuple):
     is_argument: bool = False
 
 
-IMAGE_FILES = "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM file or folder, or a 2-D picture."
+IMAGE_FILES = (
+    "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a TIFF stack, a folder of slices, a DICOM file or folder, or a 2-D picture."
+)
 JsonOption = Annotated[Path | None, Option("FILE", "Write every number here.", "json")]
 ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
 AVERAGE_OPTION = Option(
@@ -72,6 +74,9 @@ class BoxPart:
 
     volume: Annotated[int | None, Option("K", "Volume of a 4-D file, from 0.")] = None
     crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep voxels A to B - 1 and so on; an end may be empty.")] = None
+    spacing_mm: Annotated[
+        str | None, Option("MM|X,Y,Z", "Voxel sizes of TIFF stacks and folders of slices that do not state them.")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)

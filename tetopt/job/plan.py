@@ -363,7 +363,7 @@ def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
 def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
     """Return the limits on sizes, if the options set any."""
     by_label = None if job.label_size is None else label_sizes_of(job.label_size, table)
-    field = None if job.sizing is None else read_companion(job.sizing)
+    field = None if job.sizing is None else read_companion(job.sizing, job.spacing_mm)
     values = {
         "smallest": job.size_min, "edge_size": job.edge_size, "gradation": job.gradation, "field": field,
         "longest": job.edge_max, "cells_across": job.cells_across, "by_label": by_label,

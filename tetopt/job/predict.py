@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import prod
 from typing import Any
 
@@ -14,9 +15,9 @@ from tetopt.contents.content import Content
 from tetopt.engine.cost import RunSize, predicted
 from tetopt.engine.meshing import QUADRATIC_NODES, corners_of
 from tetopt.image import Image
-from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
+from tetopt.io.images import file_shape, parse_crop, parse_slice
 from tetopt.io.zarr_images import is_zarr
-from tetopt.job.inputs import file_and_volume, tissue_files
+from tetopt.job.inputs import file_and_volume, read_image, tissue_files
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
 from tetopt.start.octree import is_near, least_nodes, nodes_of_sizes
@@ -83,7 +84,7 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
         As for `tetopt.io.images.file_shape`, or `load_image` for a picture or DICOM, which is read.
     """
     job, path = plan.job, plan.job.images[0]
-    shape = cropped_shape(plan, (file_shape(path) or load_image(path, volume=job.volume).shape)[:3])
+    shape = cropped_shape(plan, (file_shape(path) or read_image(path, replace(job, slice_=None, crop=None)).shape)[:3])
     if job.slice_ is not None:
         axis, _ = parse_slice(job.slice_)
         shape = shape[:axis] + shape[axis + 1 :]

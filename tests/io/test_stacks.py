@@ -1,0 +1,117 @@
+"""TIFF stacks and folders of slices: voxel sizes, order, and what is refused."""
+
+import numpy as np
+import PIL.Image
+import pytest
+from commands import assert_refused as assert_command_refused
+
+from tetopt.errors import InputError
+from tetopt.io.images import load_image
+
+tifffile = pytest.importorskip("tifffile")
+pytestmark = pytest.mark.usefixtures("here")
+VOXELS = np.arange(10 * 5 * 7, dtype=np.uint16).reshape(10, 5, 7)  # slices, rows, columns
+
+
+def stack(folder, voxels=VOXELS, name="a.tif", **options):
+    tifffile.imwrite(folder / name, voxels, **options)
+    return folder / name
+
+
+def folder_of(folder, numbers, suffix=".tif"):
+    for number in numbers:
+        PIL.Image.fromarray((VOXELS[number % 10] % 256).astype(np.uint8)).save(folder / f"scan_v2_{number}{suffix}")
+    return folder
+
+
+IMAGEJ = {"spacing": 30, "unit": "um", "axes": "ZYX"}
+CALIBRATED = {  # options of tifffile, voxel sizes
+    "ImageJ, um": ({"imagej": True, "resolution": (0.05, 0.025), "metadata": IMAGEJ}, [0.02, 0.04, 0.03]),
+    "ImageJ, channels": (
+        {"imagej": True, "resolution": (20, 20), "metadata": {"spacing": 0.05, "unit": "mm"}}, [0.05] * 3
+    ),
+    "OME, um": (
+        {"ome": True, "metadata": {"axes": "ZYX", "PhysicalSizeX": 20, "PhysicalSizeY": 20, "PhysicalSizeZ": 0.03,
+                                   "PhysicalSizeZUnit": "mm"}}, [0.02, 0.02, 0.03],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALIBRATED)
+def test_calibrated_stack(tmp_path, name):
+    options, steps = CALIBRATED[name]
+    path = stack(tmp_path, **options)
+    image = load_image(path)
+    np.testing.assert_array_equal(image.data, VOXELS.T)
+    np.testing.assert_allclose(image.affine, np.diag([-steps[0], -steps[1], steps[2], 1.0]))
+    assert load_image(path, spacing_mm=steps).shape == (7, 5, 10)
+    with pytest.raises(InputError, match=r"but `spacing_mm` is 0\.1 x 0\.1 x 0\.1"):
+        load_image(path, spacing_mm=0.1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"resolution": (500, 500), "resolutionunit": 3},
+     {"imagej": True, "resolution": (20, 20), "metadata": {"unit": "mm", "axes": "ZYX"}},
+     {"imagej": True, "metadata": {"unit": "pixel", "spacing": 2.0, "axes": "ZYX"}}],
+)  # fmt: skip
+def test_stack_without_voxel_size(tmp_path, options):
+    path = stack(tmp_path, **options)
+    with pytest.raises(InputError, match=r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`"):
+        load_image(path)
+    if options.get("imagej") is None:
+        assert load_image(path, spacing_mm=[0.02, 0.02, 0.05]).spacing.tolist() == [0.02, 0.02, 0.05]
+
+
+@pytest.mark.parametrize(
+    ("voxels", "options", "match"),
+    [(VOXELS[:, None], {"imagej": True, "metadata": {"axes": "TZYX"}}, "got 10 time points"),
+     (np.stack([VOXELS] * 2, 1), {"imagej": True, "metadata": {"axes": "ZCYX"}}, "got 2 channels"),
+     (np.stack([VOXELS] * 3, -1), {"photometric": "rgb"}, "got 3 colours"),
+     (VOXELS, {"ome": True, "metadata": {"axes": "TYX"}}, "got 10 time points")],
+)  # fmt: skip
+def test_stacks_of_no_volume(tmp_path, voxels, options, match):
+    with pytest.raises(InputError, match=match):
+        load_image(stack(tmp_path, voxels, **options), spacing_mm=1.0)
+
+
+def test_truncated_stack(tmp_path):
+    path = stack(tmp_path)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match=r"a\.tif: "):
+        load_image(path, spacing_mm=1.0)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".png", ".bmp"])
+def test_folder_of_slices(tmp_path, suffix):
+    """In the order of their numbers, 8, 9, 10, 11."""
+    path = folder_of(tmp_path, range(8, 12), suffix)
+    image = load_image(path, spacing_mm=0.02)
+    np.testing.assert_array_equal(image.data, (VOXELS[[8, 9, 0, 1]] % 256).T)
+    np.testing.assert_allclose(image.affine, np.diag([-0.02, -0.02, 0.02, 1.0]))
+    with pytest.raises(InputError, match="this folder of 4 slices states no voxel size"):
+        load_image(path)
+    (path / f"scan_v2_10{suffix}").unlink()
+    with pytest.raises(InputError, match=f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing"):
+        load_image(path, spacing_mm=0.02)
+
+
+def test_slices_that_differ(tmp_path):
+    path = folder_of(tmp_path, range(4))
+    PIL.Image.fromarray(VOXELS[0].astype(np.uint8)).save(path / "preview.png")
+    with pytest.warns(UserWarning, match="preview.png does not belong to the series of scan_v2_0.tif"):
+        load_image(path, spacing_mm=1.0)
+    PIL.Image.fromarray(VOXELS[0, :3].astype(np.uint8)).save(path / "scan_v2_2.tif")
+    with pytest.raises(InputError, match=r"scan_v2_2.tif: expected 5 x 7 pixels of uint8, .* got 3 x 7"):
+        load_image(path, spacing_mm=1.0)
+    folder_of(path, range(3), ".png")
+    with pytest.raises(InputError, match="expected one series of numbered slices"):
+        load_image(path, spacing_mm=1.0)
+
+
+def test_a_command_names_its_option(tmp_path, capfd):
+    path = stack(tmp_path)
+    assert_command_refused(capfd, ["mesh", path, "-o", tmp_path / "a.vtu"], "states no voxel size .* --spacing-mm")
+    assert_command_refused(
+        capfd, ["mesh", path, "-o", tmp_path / "a.vtu", "--spacing-mm", "x"], 'expected one number or three, .*got "x"'
+    )
