@@ -301,7 +301,7 @@ def with_labels(loaded: MeshFile, path: Path | None, options: LabelledPart) -> M
     """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
     if path is None:
         return loaded
-    labels = checked_labels(str(path), read_companion(path), is_map=True)
+    labels = checked_labels(str(path), read_companion(path, options.spacing_mm), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 
