@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from meshes import delaunay_box
-from states import Engine, ball
+from states import Engine, ball, random_case
 
 import tetopt
+import tetopt.engine.repair
 from tetopt.energy.sampling import overlap_of
 from tetopt.geometry.check import check_unfolded, manifold_problems
 from tetopt.io.formats import file_bytes
@@ -173,3 +174,24 @@ def test_cells_are_lifted_no_longer_than_a_run_has_time():
         engine.assert_sound()
     assert n_moves == sorted(n_moves)
     assert n_moves[0] == 0 < n_moves[2] <= n_all
+
+
+def test_lifting_skips_only_what_would_fail_again(monkeypatch):
+    """An angle out of reach: without the marks all is tried again, many times over, and the same comes of it."""
+    marked, every = (random_case(3, 3) for _ in range(2))
+    lifted = marked.repair(40.0)
+    tried, displace = [], tetopt.engine.repair._displace
+
+    def unmarked(state, stars, bad, target, is_stuck):
+        is_stuck[:] = False
+        tried.append(len(bad))
+        return displace(state, stars, bad, target, is_stuck)
+
+    monkeypatch.setattr(tetopt.engine.repair, "_displace", unmarked)
+    monkeypatch.setattr(tetopt.engine.repair, "DISPLACED_AT_ONCE", 1)
+    again = every.repair(40.0)
+    assert (lifted.n_below, lifted.n_moves) == (again.n_below, again.n_moves)
+    assert again.n_below > 0
+    assert len(tried) > 100
+    np.testing.assert_array_equal(marked.complex.ticks, every.complex.ticks)
+    np.testing.assert_array_equal(marked.cells, every.cells)

@@ -44,7 +44,7 @@ from tetopt.engine.flips import (
 from tetopt.engine.smooth import slid, star_energy, store, trial_of
 from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
-from tetopt.system.kernels import Floats1, Floats2, Ints1, entry, helper, unit
+from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round without changes ends them earlier
 DISPLACED_AT_ONCE = 200  # cells between two checks of the time: up to 0.1 s, at 0.4 ms each
@@ -84,36 +84,52 @@ def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lamb
     """
     target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
+    is_stuck = np.zeros(len(source), dtype=bool)  # nodes that could not be displaced, while their stars stay the same
     for _ in range(REPAIR_ROUNDS):
         bad = _worst_first(state, target)
         if len(bad) == 0 or is_over():
             break
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
             state = grown(state)
+        before = state.complex.cells[: state.complex.n_cells[0]].copy()
         n_made = _reconnect(state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2]))
+        _free_changed(is_stuck, before, state.complex.cells[: state.complex.n_cells[0]])
         bad = _worst_first(state, target)
         if len(bad):
-            n_made += _displaced(state, bad, target, is_over)
+            n_made += _displaced(state, bad, target, is_over, is_stuck)
         bad = _worst_first(state, target)
         if n_made == 0 and len(bad):
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)
+            is_stuck = np.zeros(len(source), dtype=bool)
         if n_made == 0 and len(bad):  # nodes between labels may leave their surfaces
-            n_made = _displaced(_released(state), bad, target, is_over)
+            is_stuck[:] = False
+            n_made = _displaced(_released(state), bad, target, is_over, is_stuck)
+            is_stuck[:] = False
         n_moves += n_made
         if n_made == 0:
             break
     return Repaired(state, source, len(_worst_first(state, target)), n_moves)
 
 
-def _displaced(state: State, bad: NDArray[np.int64], target: float, is_over: Callable[[], bool]) -> int:
+def _free_changed(is_stuck: NDArray[np.bool_], before: NDArray[np.int64], after: NDArray[np.int64]) -> None:
+    """Clear the marks of the nodes of cells that differ."""
+    both = min(len(before), len(after))
+    is_other = (before[:both] != after[:both]).any(axis=1)
+    for nodes in (before[:both][is_other], after[:both][is_other], before[both:], after[both:]):
+        is_stuck[nodes] = False
+
+
+def _displaced(
+    state: State, bad: NDArray[np.int64], target: float, is_over: Callable[[], bool], is_stuck: NDArray[np.bool_]
+) -> int:
     """`_displace` until `is_over` returns True, as tens of thousands of cells far smaller than voxels took minutes."""
     stars, n_made = node_stars(state), 0
     for begin in range(0, len(bad), DISPLACED_AT_ONCE):
         if is_over():
             break
-        n_made += _displace(state, stars, bad[begin : begin + DISPLACED_AT_ONCE], target)
+        n_made += _displace(state, stars, bad[begin : begin + DISPLACED_AT_ONCE], target, is_stuck)
     return n_made
 
 
@@ -237,15 +253,26 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
 
 
 @entry
-def _displace(state: State, stars: NodeStars, bad: Ints1, target: float) -> int:
-    """Move the nodes of each bad cell so that the worst angle of their stars grows, up to the target."""
+def _displace(state: State, stars: NodeStars, bad: Ints1, target: float, is_stuck: Bools1) -> int:
+    """Move the nodes of each bad cell so that the worst angle of their stars grows, up to the target.
+
+    A node that found no better place, marked in `is_stuck`, is tried again only after its star has changed: where the
+    target is out of reach, most nodes of most cells fail, in each of some 20 cells and in each round.
+    """
     x, n_made = np.empty((4, 3)), 0
     for number in range(len(bad)):
         for k in range(4):
             if cell_cosine(x, state, bad[number]) >= target:
                 break
-            if _lift(x, state, stars, state.complex.cells[bad[number], k], target):
+            node = state.complex.cells[bad[number], k]
+            if is_stuck[node]:
+                continue
+            is_stuck[node] = not _lift(x, state, stars, node, target)
+            if not is_stuck[node]:
                 n_made += 1
+                for r in range(stars.start[node], stars.start[node + 1]):
+                    for corner in range(4):
+                        is_stuck[state.complex.cells[stars.cells[r], corner]] = False
     return n_made
 
 
