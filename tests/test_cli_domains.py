@@ -9,7 +9,7 @@ import nibabel
 import numpy as np
 import PIL.Image
 import pytest
-from commands import exit_code, numbers_in
+from commands import assert_refused, exit_code, numbers_in
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
@@ -465,3 +465,48 @@ def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
     counted = {row["label"]: row["voxels"] for row in numbers_in(tmp_path / "s.json")["labels"]}
     plane = labels[4:20, :, 13]  # the nearest above the middle of two
     assert counted == {label: np.count_nonzero(plane == label) for label in (0, 5, 2**31 - 1)}
+
+
+def test_labels_of_a_segmentation_are_the_mask(tmp_path, monkeypatch, capfd):
+    """By number or name, several together; the labels' own file may be the mask's."""
+    monkeypatch.chdir(tmp_path)
+    labels = np.where(distance((20, 20, 20), 9, 9, 9) < 7, 5.0, 0.0)
+    labels[:10][labels[:10] > 0] = 2.0
+    tetopt.save_image("l.nii.gz", tetopt.Image(labels))
+    (tmp_path / "names.csv").write_text("label,name\n5,liver\n2,spleen\n")
+    mesh = [
+        "mesh",
+        "l.nii.gz",
+        "--mask",
+        "l.nii.gz",
+        "--nodes",
+        "150",
+        "--iterations",
+        "0",
+        "--json",
+        "a.json",
+        "--force",
+    ]
+    for words, chosen in ((["5"], [5]), (["liver,2", "--label-names", "names.csv", "--labels", "l.nii.gz"], [2, 5])):
+        assert exit_code(*mesh, "-o", "a.vtu", "--mask-label", *words) in (0, 1)
+        numbers = numbers_in(tmp_path / "a.json")
+        assert numbers["mask"]["voxels"] == np.isin(labels, chosen).sum()
+        assert numbers["inputs"]["mask_label"] == words[0]
+    measured = [
+        "quality",
+        "a.vtu",
+        "--image",
+        "l.nii.gz",
+        "--mask",
+        "l.nii.gz",
+        "--mask-label",
+        "2,5",
+        "--json",
+        "q.json",
+    ]
+    assert exit_code(*measured, "--force") == 0
+    assert numbers_in(tmp_path / "q.json")["mask"]["voxels"] == np.count_nonzero(labels)
+    capfd.readouterr()
+    assert_refused(capfd, [*mesh, "-o", "b.vtu", "--mask-label", "7"], 'no voxel with label "7"; it has 0, 2, 5$')
+    assert_refused(capfd, [*mesh, "-o", "b.vtu"], "got 3 values from 0 to 5 .*; choose labels with --mask-label")
+    assert_refused(capfd, ["mesh", "l.nii.gz", "-o", "b.vtu", "--mask-label", "5"], "--mask-label: needs --mask$")

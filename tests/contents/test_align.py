@@ -206,7 +206,7 @@ def test_masks_that_are_none():
     )
     labels = np.arange(24).reshape(4, 3, 2)
     what = "m.nii: expected a mask (0 and one other value, or fractions from 0 to 1), got "
-    todo = "; convert it to 0 and 1 first"
+    todo = "; choose labels with `mask_label`, or convert it to 0 and 1"
     assert said(labels) == what + "24 values from 0 to 23 (0, 1, 2, 3, 4, ...)" + todo
     assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
     assert said(labels % 2 + 1) == what + "2 values from 1 to 2 (1, 2)" + todo

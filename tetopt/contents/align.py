@@ -391,7 +391,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
         raise InputError(
             f"{name}: expected a mask (0 and one other value, or fractions from 0 to 1), got {len(values)} values from "
-            f"{values[0]:g} to {values[-1]:g} ({some}); convert it to 0 and 1 first"
+            f"{values[0]:g} to {values[-1]:g} ({some}); choose labels with `mask_label`, or convert it to 0 and 1"
         )
     if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"

@@ -39,7 +39,7 @@ from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, own_mask
-from tetopt.model.labels import NO_TABLE, TABLE_TEXT, labels_of, table_words
+from tetopt.model.labels import NO_TABLE, TABLE_TEXT, label_words, labels_named, labels_of, table_words
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.budget import available_bytes, memory_words
@@ -49,6 +49,7 @@ from tetopt.system.incoming import rows_of
 OUTSIDE_FRACTION = 0.02  # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
 DIVIDED_BYTES = 300.0  # per voxel of a run with labels, measured
+MASK_LABELS_LISTED = 20  # in a message
 NAMES_LISTED = 8  # as many as fit on a line
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
@@ -90,6 +91,10 @@ def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tup
     return image, None if labels_path is None else read_labels(labels_path, image, part)
 
 
+Align = Callable[[Image, Image, str], Image]
+Originals = Mapping[tuple[Path, Align], Image]
+
+
 class Aligned(NamedTuple):
     """An image, and a function that reads other files and aligns them to it."""
 
@@ -98,15 +103,16 @@ class Aligned(NamedTuple):
     factors: tuple[int, ...]  # parts of the file's voxels along each axis
 
 
-def image_and_others(path: Path, part: ImagePart, finest: Sequence[Path | None] = ()) -> Aligned:
-    """Read the selected part of an image, on voxels divided to the size of the `finest` files' (labels or a mask)."""
+def image_and_others(path: Path, part: ImagePart, finest: Originals | None = None) -> Aligned:
+    """Read the selected part of an image, on voxels divided to the size of the `finest` of labels and mask."""
     image = read_image(path, part)
     # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
     slice_ = None if part.slice_ is None else parse_slice(part.slice_)
     whole = coarse = image if slice_ is None else read_image(path, replace(part, slice_=None, crop=None))
     crop = None if part.crop is None else parse_crop(part.crop)
-    originals = {other: read_companion(other, part.spacing_mm) for other in finest if other is not None}
-    factors = _divisions(whole, originals, None if slice_ is None else slice_[0])
+    originals = finest or {}
+    finer = {other: each for (other, _), each in originals.items()}
+    factors = _divisions(whole, finer, None if slice_ is None else slice_[0])
     if max(factors) > 1:
         whole = divided(whole, factors)
         if crop is not None:
@@ -117,7 +123,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Sequence[Path | None] 
         image = whole if slice_ is None else part_of(whole, slice_, crop)
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        original = originals[other] if other in originals else read_companion(other, part.spacing_mm)
+        original = originals.get((other, aligned)) or read_companion(other, part.spacing_mm)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
         moved = aligned(original, grid, str(other))
@@ -264,6 +270,7 @@ def mask_for(
         The mask cannot be read, or is needed.
     """
     if options.mask is None:
+        read_mask(options)
         return None if loaded is None else own_mask(loaded, image)
     mask = beside(options.mask, resample_mask)
     own = None if loaded is None or MASK_TEXT not in loaded.field_data else own_mask(loaded, image)
@@ -273,10 +280,45 @@ def mask_for(
     return mask
 
 
+def read_mask(options: MaskPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
+    """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`; none without one.
+
+    Names of labels are those of the table `names_of`, or else of the mask's own file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read; it does not have a label, or its table a name.
+    """
+    path, words = options.mask, options.mask_label
+    if path is None:
+        if words is not None:
+            raise InputError("`mask_label`: needs `mask`")
+        return {}
+    mask = read_companion(path, getattr(options, "spacing_mm", None))
+    if words is None:
+        return {(path, resample_mask): mask}
+    mask, table = checked_labels(str(path), mask, is_map=True), names_of
+    if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
+        table = path
+    names, present = {} if table is None else load_label_table(table).names, np.unique(mask.data).astype(np.int64)
+    chosen: list[int] = []
+    for word in words.split(","):
+        try:
+            labels = labels_named(word, names)
+        except InputError as error:
+            raise InputError(f"`mask_label`: {error}") from error
+        if not np.isin(labels, present).any():
+            listed_words = listed([label_words(label, names) for label in present.tolist()], MASK_LABELS_LISTED)
+            raise InputError(f'`mask_label`: {path} has no voxel with label "{word.strip()}"; it has {listed_words}')
+        chosen += labels
+    return {(path, resample_mask): Image(np.isin(mask.data, chosen), mask.affine)}
+
+
 def check_part(part: LabelledPart, image: Path | None) -> None:
     """Raise InputError for options that select the voxels of an image if there is none."""
     needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
-    needs_image |= {"mask": part.mask} if part.labels is None else {}
+    needs_image |= {"mask": part.mask, "mask_label": part.mask_label} if part.labels is None else {}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs `image`")
 
@@ -289,7 +331,7 @@ def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshF
     InputError
         As for `mask_for`; the image's dimension differs from the mesh's.
     """
-    whole, beside, _ = image_and_others(path, part, [options.mask])
+    whole, beside, _ = image_and_others(path, part, read_mask(options))
     if whole.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
     mask = mask_for(options, whole, beside, loaded)
@@ -306,7 +348,7 @@ def with_labels(loaded: MeshFile, path: Path | None, options: LabelledPart) -> M
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        return aligned(read_companion(other, options.spacing_mm), labels, str(other))
+        return aligned(read_mask(options)[other, aligned], labels, str(other))
 
     try:
         counted = continued(labels, mask_for(options, labels, beside, loaded))

@@ -15,7 +15,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
 from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
-from tetopt.job.options import WHOLE_IMAGE, ImagePart, SourceOptions
+from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
@@ -98,6 +98,7 @@ class Judgement(NamedTuple):
 
 def judge(
     mesh: Path, image: Path | None = None, mask: Path | None = None, labels: Path | None = None,
+    mask_label: str | None = None,
     *, part: ImagePart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
 ) -> Judgement:  # fmt: skip
     """Measure a mesh's file: its shape and, given an image, mask and labels, the fit of its cells.
@@ -112,8 +113,8 @@ def judge(
     """
     if image is None and (mask is not None or labels is not None):
         raise InputError("`mask` and `labels`: need an `image`, on whose voxels they are compared")
-    if label_names is not None and labels is None:
-        raise InputError("`label_names`: needs `labels`")
+    if label_names is not None and labels is None and mask_label is None:
+        raise InputError("`label_names`: needs `labels` or `mask_label`")
     loaded = read_mesh(mesh)
     shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
@@ -121,7 +122,8 @@ def judge(
         numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
-        source = _source(loaded, image, mask, labels, part)
+        region = MaskPart(mask=mask, mask_label=mask_label)
+        source = _source(loaded, image, region, labels, part, label_names)
         warn_of_other_image(loaded, mesh, image, source.contrasts[0] if check else None, is_exact=check)
         has_mask = mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
@@ -137,20 +139,24 @@ def judge(
     return judgement
 
 
-def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
+def _source(
+    loaded: MeshFile, image: Path, region: MaskPart, labels: Path | None, part: ImagePart, names: Path | None
+) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
     tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
-        images=[image], mask=mask, labels=labels, **vars(part),
+        images=[image], labels=labels, **vars(part), **vars(region),
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
     )  # fmt: skip
-    return read_source(options, numbers=None if labels is None else _merged(inputs, labels, part), loaded=loaded)
+    names = None if region.mask_label is None else names
+    numbers = None if labels is None else _merged(inputs, labels, part)
+    return read_source(options, names, numbers=numbers, loaded=loaded)
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:

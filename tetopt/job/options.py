@@ -86,6 +86,11 @@ class ImagePart(BoxPart):
     slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, as a 2-D image; for example k=90.", "slice")] = None
 
 
+MaskLabelOption = Annotated[
+    str | None, Option("LABEL,...", "Labels of the `mask`, a label image, that are in the mask: numbers or names.")
+]
+
+
 @dataclass(frozen=True, kw_only=True)
 class MaskPart:
     """Mask of the voxels that count for a mesh's file."""
@@ -94,6 +99,7 @@ class MaskPart:
         Path | None,
         Option("MASK", "The mask that the mesh was built within, unless its file contains it: no other voxel counts."),
     ] = None
+    mask_label: MaskLabelOption = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +125,7 @@ class RegionOptions:
     mask: Annotated[
         Path | None, Option("MASK", "Mesh only this region (0/1, or 0 to 1), with its boundary on the mask's surface.")
     ] = None
+    mask_label: MaskLabelOption = None
     background: Annotated[
         str | None,
         Option(

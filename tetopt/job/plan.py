@@ -210,6 +210,8 @@ def changed(job: JobOptions, **values: Any) -> JobOptions:
 
 def _check_source(job: JobOptions) -> None:
     """Raise InputError for contradictions among the options of mask and labels."""
+    if job.mask_label is not None and job.mask is None:
+        raise InputError("`mask_label`: needs `mask`")
     if job.mask is not None and job.background is not None:
         raise InputError("`mask` and `background`: give only one of them")
     if job.keep_components and job.mask is None and job.background is None:
@@ -220,7 +222,7 @@ def _check_source(job: JobOptions) -> None:
         raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
         for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
-            if getattr(job, name) is not None:
+            if getattr(job, name) is not None and not (name == "label_names" and job.mask_label is not None):
                 raise InputError(f"`{name}`: needs `labels`")
         if job.free_volumes:
             raise InputError("`free_volumes`: needs `labels`")

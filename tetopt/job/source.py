@@ -26,6 +26,7 @@ from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
+    Originals,
     balance_of,
     file_and_volume,
     image_and_others,
@@ -33,6 +34,8 @@ from tetopt.job.inputs import (
     listed,
     mask_for,
     number_of,
+    read_companion,
+    read_mask,
     tissue_files,
     tissue_volumes,
 )
@@ -121,7 +124,10 @@ def read_source(
     background in the options, that of a mesh's file counts, if one was `loaded`.
     """
     paths = options.images
-    image, beside, factors = image_and_others(paths[0], options, [options.labels, options.mask])
+    finest: Originals = read_mask(options, label_names)
+    if options.labels is not None:
+        finest = {**finest, (options.labels, resample_labels): read_companion(options.labels, options.spacing_mm)}
+    image, beside, factors = image_and_others(paths[0], options, finest)
     labels, table, numbers, tissues, is_own = _labelling(options, image, beside, label_names, numbers)
     if labels is not None and is_own and numbers:
         image = labels
@@ -154,6 +160,7 @@ def read_source(
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({"free_volumes": True} if options.free_volumes else {}),
         **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
+        **({} if options.mask_label is None else {"mask_label": options.mask_label}),
         **({"divided": factors} if max(factors) > 1 else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: checksum(path) for path in files},
