@@ -457,7 +457,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("quality {disc}", "expected a .vtu, .vtk, .vtkhdf, .msh or .msh2 mesh"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
-        ("quality", "Missing argument 'MESH'"),
+        ("quality", "Missing argument '[IMAGE] MESH'"),
         ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),
         ("phantom sphere -o a.png", "ending in .nii or .nii.gz"),
@@ -533,7 +533,7 @@ def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys,
 
 
 def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
-    """Each of at most thirteen options, and the help."""
+    """Each of at most fifteen options, and the help."""
     monkeypatch.setenv("COLUMNS", "80")
     assert exit_code("mesh", "--help") == 0
     groups = re.split(r"^╭─ (.+?) ─+╮$", capsys.readouterr().out, flags=re.M)[1:]
@@ -541,7 +541,7 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 6, "Region and labels": 13, "Number and size of cells": 9, "Initial mesh": 4,
+        "Options": 6, "Region and labels": 15, "Number and size of cells": 9, "Initial mesh": 4,
         "Optimisation": 11, "Meshing in parts": 5, "For the solver": 13,
     }  # fmt: skip
 
@@ -862,7 +862,7 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
     [
         (["--method", "paper"], "only with --method fast"),
         (["--spacing", "3"], "no single spacing"),
-        (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels; use at most 5000$"),
+        (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels; use at most 5000"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--edge-size", "0.2"], "sizes: the requested edges are so short that cells are smaller"),

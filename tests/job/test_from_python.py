@@ -62,7 +62,7 @@ def test_refusals_name_arguments(place):
     with pytest.raises(InputError, match=r"moduli: pass `young`"):
         solve_file(mesh, model=ModelOptions(), part=LabelledPart())
     with pytest.raises(InputError, match=r"^`mask`: needs `image`"):
-        convert_file(mesh, place / "b.inp", solver=SolverOptions(), part=LabelledPart(), mask=mesh)
+        convert_file(mesh, place / "b.inp", solver=SolverOptions(), part=LabelledPart(mask=mesh))
     with pytest.raises(InputError, match=r"give exactly one of `below`, `label`, `cell_set`"):
         write_surface(mesh, place / "b.stl", SurfacePart())
 

@@ -146,7 +146,7 @@ def test_sizes_by_headers(image_path, tmp_path, monkeypatch):
     """Without voxels being read; what only these tell is as in a run whose files were read."""
     shape = sample_image(3).shape
     n_voxels = int(np.prod(shape))
-    monkeypatch.setattr(predict, "load_image", None)
+    monkeypatch.setattr(predict, "read_image", None)
     plan = plan_of(tmp_path, [image_path], mask=image_path, labels=Path(f"{image_path}:0"), nodes=150)
     size = predict.size_by_headers(plan)
     assert size == RunSize(3 * n_voxels, n_voxels, 150, 16, 3, has_region=True, has_memberships=True)
@@ -158,7 +158,7 @@ def test_sizes_by_headers(image_path, tmp_path, monkeypatch):
     with pytest.raises(tetopt.InputError, match="no such file"):
         predict.size_by_headers(plan_of(tmp_path, [tmp_path / "none.nii.gz"]))
     (tmp_path / "b.png").touch()
-    monkeypatch.setattr(predict, "load_image", lambda path, volume: tetopt.Image(np.eye(5)))
+    monkeypatch.setattr(predict, "read_image", lambda path, part: tetopt.Image(np.eye(5)))
     assert predict.size_by_headers(plan_of(tmp_path, [tmp_path / "b.png"])).n_read == 25
 
 

@@ -157,11 +157,9 @@ def test_records_are_looked_into():
         tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(edge_size="5"))
     with pytest.raises(tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"):
         tetopt.octree_mesh(IMAGE, 100, tetopt.Sizes(field="a.nii"))
-    words = (
-        r"cell_fields: image: expected Image or None, got tetopt\.contents\.content\.Content; use .* image of a Content"
-    )
+    words = r"cell_moments: image: expected Image, got tetopt\.contents\.content\.Content; use .* image of a Content"
     with pytest.raises(tetopt.InputError, match=words):
-        tetopt.cell_fields(MESH, tetopt.content(IMAGE))
+        tetopt.cell_moments(tetopt.content(IMAGE), MESH)
 
 
 @pytest.mark.parametrize(

@@ -193,12 +193,10 @@ class Content(NamedTuple):
     @property
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
-        inside = None if self.inside is None else self.once(self.inside)
-        return float(sum(noise_level(self.once(values), inside) ** 2 for values in self.values[: self.n_contrasts]))
-
-    def once(self, values: NDArray) -> NDArray:
-        """Return one of each group of voxels that repeat one of the image's file."""
-        return values[tuple(slice(None, None, factor) for factor in self.repeats)]
+        inside = None if self.inside is None else undivided(self, self.inside)
+        return float(
+            sum(noise_level(undivided(self, values), inside) ** 2 for values in self.values[: self.n_contrasts])
+        )
 
 
 def content(
@@ -362,6 +360,11 @@ def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> l
     check_tissues(tissues)
     warn_of_sums(tissues)
     return list(tissues)
+
+
+def undivided(what: Content, values: NDArray) -> NDArray:
+    """Return one of each group of voxels that repeat one of the image's file."""
+    return values[tuple(slice(None, None, factor) for factor in what.repeats)]
 
 
 def plain(image: Image | Content) -> Content:

@@ -123,10 +123,10 @@ class MeshingResult(NamedTuple):
         Unexplained fraction of the content's variance: E_D over variance times volume. Only from `mesh_image`.
     n_dropped : int
         Connected components that were dropped, since the mask does not have them.
-    dropped : mapping of int to float
-        Volume of these components by label, mm^n; all of label 0 without labels.
     curving : Curving, optional
         For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the smooth level.
+    dropped : mapping of int to float
+        Volume of the dropped components by label, mm^n; all of label 0 without labels.
 
     Examples
     --------

@@ -131,7 +131,8 @@ def _lost(measured: dict[str, Any]) -> Iterator[Problem]:
     far = [label for label, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
     if far := sorted(far, key=lambda label: -max(ratios[label], 1.0 / ratios[label])):
         worst = ", ".join(f"{words[label]} ({ratios[label]:.2g})" for label in far)
-        text = f"{len(far)} labels have more than {VOLUME_RATIO:g} times the volume of their voxels, or less than half"
+        count = "1 label has" if len(far) == 1 else f"{len(far)} labels have"
+        text = f"{count} more than {VOLUME_RATIO:g} times the volume of their voxels, or less than half"
         yield Problem(f"{text} (ratio in brackets): {worst}", "allow more nodes", wants="smaller")
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:

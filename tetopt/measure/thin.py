@@ -226,7 +226,7 @@ def _medians(label: NDArray[np.int64], values: NDArray[np.floating]) -> dict[int
     """Return the median of the values of each label."""
     order = np.argsort(label, kind="stable")
     numbers, starts = np.unique(label[order], return_index=True)
-    parts = np.split(values[order], starts[1:])
+    parts = np.split(values[order], starts)[1:]
     return {int(number): float(np.median(part)) for number, part in zip(numbers, parts, strict=True)}
 
 

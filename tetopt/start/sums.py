@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content
+from tetopt.contents.content import Content, undivided
 from tetopt.contents.noise import NoiseSample, noise_sample, sampled_noise
 from tetopt.contents.statistics import mean_of, row_sums, statistics
 from tetopt.errors import InputError
@@ -61,10 +61,10 @@ def channels_of(content: Content) -> Channels:
     scale = scale or 1.0
     result = Channels(means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2)
     # The noise is estimated on scaled values, too, as the estimate would round differently otherwise.
-    within = None if content.inside is None else noise_sample(content.once(content.inside))
+    within = None if content.inside is None else noise_sample(undivided(content, content.inside))
     noise = 0.0
     for channel, values in enumerate(content.values[: content.n_contrasts]):
-        sample = noise_sample(content.once(values))
+        sample = noise_sample(undivided(content, values))
         parts = zip(sample, (None, None) if within is None else within, strict=True)
         scaled = NoiseSample(*(result.scaled(part, channel, inside) for part, inside in parts))
         noise += sampled_noise(scaled, None if within is None else within.near) ** 2
