@@ -457,7 +457,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("quality {disc}", "expected a .vtu, .vtk, .vtkhdf, .msh or .msh2 mesh"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
-        ("quality", "Missing argument '[IMAGE] MESH'"),
+        ("quality", r"Missing argument '\[IMAGE\] MESH'"),
         ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),
         ("phantom sphere -o a.png", "ending in .nii or .nii.gz"),

@@ -30,7 +30,7 @@ VALUES = {
     "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
     "space": "lps", "keep_components": True, "free_volumes": True,
     "cells_across": 1.5, "label_size": "1=2", "merge": "white=2,41; rest=*",
-    "tissues": Path("/c1.nii,/c2.nii"), "mask_label": "5,liver",
+    "tissues": Path("/c1.nii,/c2.nii"), "mask_label": "5,liver", "spacing_mm": "0.5",
 }  # fmt: skip
 
 
