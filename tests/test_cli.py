@@ -574,7 +574,7 @@ HEAVY = "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage 
         ("import tetopt.cli; tetopt.cli.main(['--version'])", ""),
         ("import tetopt.cli; tetopt.cli.main(['msh'])", ""),
         # The rest is loaded where a run comes to it.
-        ("import tetopt.cli.mesh", "nibabel numba"),
+        ("import tetopt.cli.mesh", "nibabel numba PIL"),  # nibabel loads pydicom where it is installed, and that PIL
         ("import tetopt; tetopt.mesh_image", "numba"),
     ],
 )

@@ -100,7 +100,9 @@ def deadly(folder, n_deaths, name):
 def test_what_a_killed_worker_took_with_it_is_run_again(run, tmp_path):
     done = run(partial(deadly, tmp_path, 2), list("abc"))
     assert {name: each.result for name, each in done.items()} == {"a": "a", "b": "b", "c": "c"}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.0", "b.0", "b.1", "b.2", "c.0"]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {name for name in names if name[0] == "b"} == {"b.0", "b.1", "b.2"}
+    assert names - {"b.0", "b.1", "b.2"} >= {"a.0", "c.0"}  # again, too, if the killed worker held their results
 
 
 @pytest.mark.deep
