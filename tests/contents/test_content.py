@@ -6,6 +6,7 @@ import tetopt
 from tetopt.contents.content import content, continued, plain
 from tetopt.contents.noise import noise_level
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
+from tetopt.start.sums import channels_of
 
 
 def contrasts(shape=(12, 13, 14)):
@@ -250,5 +251,18 @@ def test_noise_is_of_planes_that_the_mask_has(monkeypatch, n):
         inside[:] = False
         inside[thin] = True
         assert noise_level(data, inside) == 0.0
-    mask = tetopt.Image(1.0 * inside)
-    assert tetopt.content(tetopt.Image(data), mask=mask).noise == 0.0
+        masked = tetopt.content(tetopt.Image(data), mask=tetopt.Image(1.0 * inside))
+        assert masked.noise == channels_of(masked).noise == 0.0
+
+
+def test_both_estimates_of_the_noise_within_a_mask_are_one(monkeypatch):
+    """That of the octree is of scaled values: for whole masks, for lesions between the slices, and for one voxel."""
+    data, inside = np.random.default_rng(0).normal(0.0, 2.0, (60, 24, 20)), np.ones((60, 24, 20), dtype=bool)
+    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 14)
+    for outside in (slice(0, 6), slice(15, 60), slice(6, 14), slice(14, 15)):
+        masked = tetopt.content(tetopt.Image(data), mask=tetopt.Image(1.0 * inside))
+        channels = channels_of(masked)
+        assert channels.noise * channels.scale**2 == pytest.approx(masked.noise, rel=1e-6)
+        inside[outside] = False
+        if not inside.any():
+            inside[3, 4, 5] = True

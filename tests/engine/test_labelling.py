@@ -123,13 +123,14 @@ def test_moves_lower_the_energy(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_faults_that_are_skipped_are_none(monkeypatch, n):
-    """The same labels whether or not nodes marked sound are skipped, for cells of random content."""
+    """The same labels whether or not sound nodes, and those where nothing changed, are skipped, for random content."""
     mend, n_skipped = labelling._mend, 0
 
-    def without_marks(dual, labels, room, is_bridge, faces, is_near, is_sound, work):
+    def without_marks(dual, labels, room, is_bridge, faces, is_near, is_sound, is_due, work):
         nonlocal n_skipped
         n_skipped += np.count_nonzero(is_sound)
-        mend(dual, labels, room, is_bridge, faces, is_near, np.zeros_like(is_sound), work)
+        is_due[:] = True
+        mend(dual, labels, room, is_bridge, faces, is_near, np.zeros_like(is_sound), is_due, work)
 
     for seed in range(8):
         rng = np.random.default_rng(seed)

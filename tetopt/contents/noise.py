@@ -32,17 +32,21 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
     real volumes this was within 0.7 % of the estimate from all voxels, and equal to the last bit for whole numbers. If
     no such slice has a voxel to use, as many of those with most of them are sampled instead.
     """
-    if inside is None or min(inside.shape) < 3:
+    if inside is None:
         return sampled_noise(noise_sample(data))
+    middles = noise_planes(inside)
+    return sampled_noise(noise_sample(data, middles), noise_sample(inside, middles).near)
+
+
+def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Indices of the planes at which second differences are taken within a mask; none if no voxel is surrounded."""
     middles = noise_places(inside.shape)[1]
-    if not _surrounded(_near(inside, middles)).any():
-        within = scipy.ndimage.minimum_filter(inside, size=3)[(slice(1, -1),) * inside.ndim]
-        counts = within.sum(axis=tuple(range(1, inside.ndim)))
-        if not counts.any():
-            return 0.0
-        most = np.argsort(-counts, kind="stable")[: len(middles)]
-        middles = 1 + np.sort(most[counts[most] > 0])
-    return sampled_noise(noise_sample(data, middles), _near(inside, middles))
+    if len(middles) == 0 or _surrounded(_near(inside, middles)).any():
+        return middles
+    within = scipy.ndimage.minimum_filter(inside, size=3)[(slice(1, -1),) * inside.ndim]
+    counts = within.sum(axis=tuple(range(1, inside.ndim)))
+    most = np.argsort(-counts, kind="stable")[: len(middles)]
+    return 1 + np.sort(most[counts[most] > 0])
 
 
 def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:

@@ -169,12 +169,17 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
         _keep_each(dual, labels)
     _settle(dual, labels, least, False)
     is_bridge = np.zeros(len(labels), dtype=bool)
-    is_near, is_sound = np.ones((2, len(dual.scale)), dtype=bool)
+    is_near, is_sound, is_due = np.ones((3, len(dual.scale)), dtype=bool)
+    mended = np.full(len(labels), -1)
     for _ in range(MENDING_ROUNDS):
         before = labels.copy(), is_bridge.copy()
         _without_fragments(dual, labels, is_bridge, voxel, components)
-        is_near[:] = True
-        _mend_near(dual, labels, is_bridge, least, is_near, is_sound)
+        # Where nothing changed since mending failed, it fails again.
+        is_near[dual.cells[labels != mended]] = True
+        is_due[dual.cells[is_near[dual.cells].any(axis=1)]] = True
+        is_near[:] = is_due
+        _mend_near(dual, labels, is_bridge, least, is_near, is_sound, is_due)
+        mended = labels.copy()
         _settle(dual, labels, least, True)
         if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
             break
@@ -655,28 +660,29 @@ def _nonmanifold(
 
 def _mend_near(
     dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64],
-    is_near: NDArray[np.bool_], is_sound: NDArray[np.bool_],
+    is_near: NDArray[np.bool_], is_sound: NDArray[np.bool_], is_due: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
 
     Bridges stay, and no label falls below its volume `least`. Afterwards no node is marked near; those with a fault
-    there or at an edge, or near a change, are no longer marked sound.
+    there or at an edge, or near a change, are no longer marked sound; and those remain due where mending may succeed.
     """
     room = np.bincount(labels, dual.size, len(least)) - least
     while is_near.any():
         faces = _nonmanifold(dual, labels, is_near)[0]
         is_sound[is_near] = True
         is_sound[faces[faces >= 0]] = False
+        is_due[is_near] = False  # all places at these nodes are tried
         is_near[:] = False
-        _mend(dual, labels, room, is_bridge, faces, is_near, is_sound, _work(dual))
+        _mend(dual, labels, room, is_bridge, faces, is_near, is_sound, is_due, _work(dual))
 
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
     """Mend the remaining places between two labels, even if that removes a bridge."""
     faces, is_two = _nonmanifold(dual, labels)
     room = np.bincount(labels, dual.size, len(least)) - least
-    is_bridge, (is_near, is_sound) = np.zeros(len(labels), dtype=bool), np.zeros((2, len(dual.scale)), dtype=bool)
-    _mend(dual, labels, room, is_bridge, faces[is_two], is_near, is_sound, _work(dual))
+    is_bridge, marks = np.zeros(len(labels), dtype=bool), np.zeros((3, len(dual.scale)), dtype=bool)
+    _mend(dual, labels, room, is_bridge, faces[is_two], *marks, _work(dual))
 
 
 @entry
@@ -864,11 +870,12 @@ def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
 @entry
 def _mend(
     dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, is_sound: Bools1,
-    work: _Work,
+    is_due: Bools1, work: _Work,
 ) -> None:  # fmt: skip
     """At each place that is not manifold, make the move that most lowers the energy including pinches.
 
-    Nodes of changed cells are marked in `is_near`, and no longer in `is_sound`.
+    Nodes of changed cells are marked in `is_near`, and no longer in `is_sound`. In `is_due`, nodes are marked whose
+    places may be mended later: those with a cell that has a node of a changed one, or that a label's room kept.
     """
     star, group = np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
@@ -879,7 +886,10 @@ def _mend(
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
         for i in range(2 * count):
             size = _group(dual, labels, a, b, star[:count], i, group)
-            if size == 0 or room[labels[group[0]]] < dual.size[group[:size]].sum() or is_bridge[group[:size]].any():
+            if size == 0 or is_bridge[group[:size]].any():
+                continue
+            if room[labels[group[0]]] < dual.size[group[:size]].sum():
+                is_due[a] = True
                 continue
             new, change = _best_of_group(dual, labels, group[:size], star[:count], best, is_sound, work)
             if new >= 0:
@@ -892,7 +902,11 @@ def _mend(
             for cell in group[:size]:
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
-                    is_near[dual.cells[cell, k]], is_sound[dual.cells[cell, k]] = True, False
+                    node = dual.cells[cell, k]
+                    is_near[node], is_sound[node] = True, False
+                    for r in range(dual.star_start[node], dual.star_start[node + 1]):
+                        for m in range(dual.cells.shape[1]):
+                            is_due[dual.cells[dual.star_cells[r], m]] = True
 
 
 @unit

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, undivided
-from tetopt.contents.noise import NoiseSample, noise_sample, sampled_noise
+from tetopt.contents.noise import NoiseSample, noise_planes, noise_sample, sampled_noise
 from tetopt.contents.statistics import mean_of, row_sums, statistics
 from tetopt.errors import InputError
 from tetopt.image import Box, pieces
@@ -61,12 +61,13 @@ def channels_of(content: Content) -> Channels:
     scale = scale or 1.0
     result = Channels(means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2)
     # The noise is estimated on scaled values, too, as the estimate would round differently otherwise.
-    within = None if content.inside is None else noise_sample(undivided(content, content.inside))
-    noise = 0.0
+    inside = None if content.inside is None else undivided(content, content.inside)
+    planes = None if inside is None else noise_planes(inside)
+    within, noise = None if inside is None else noise_sample(inside, planes), 0.0
     for channel, values in enumerate(content.values[: content.n_contrasts]):
-        sample = noise_sample(undivided(content, values))
+        sample = noise_sample(undivided(content, values), planes)
         parts = zip(sample, (None, None) if within is None else within, strict=True)
-        scaled = NoiseSample(*(result.scaled(part, channel, inside) for part, inside in parts))
+        scaled = NoiseSample(*(result.scaled(part, channel, mask) for part, mask in parts))
         noise += sampled_noise(scaled, None if within is None else within.near) ** 2
     return result._replace(noise=float(noise))
 
