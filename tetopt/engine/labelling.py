@@ -632,16 +632,22 @@ class _Work(NamedTuple):
     label: Ints1  # the distinct labels of these
     own: Ints1  # index of each cell's label among those
     beside: Ints2  # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
-    root: Ints1  # root of each cell in its fan
+    root: Ints1  # root of each cell in its fan, or of each fan among linked ones
+    fan: Ints1  # the fan of each cell, and the outside's
+    fan_label: Ints1  # index of each fan's label; -1 for the outside
+    is_linked: Bools2  # fans with a common facet
     place: Ints1  # (M,) position of a cell in the star; -1 between calls
     steps: Ints1  # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
 
 
 def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
-    star, label, own, root = (np.empty(widest + 1, dtype=np.int64) for _ in range(4))
+    star, label, own, root, fan, fan_label = np.empty((6, widest + 1), dtype=np.int64)
+    is_linked = np.empty((widest + 1, widest + 1), dtype=bool)
     beside, place = np.empty((widest, dual.cells.shape[1]), dtype=np.int64), np.full(len(dual.cells), -1)
-    return _Work(star, label, own, beside, root, place, np.zeros(len(dual.scale), dtype=np.int64))
+    return _Work(
+        star, label, own, beside, root, fan, fan_label, is_linked, place, np.zeros(len(dual.scale), dtype=np.int64)
+    )
 
 
 def _nonmanifold(
@@ -807,11 +813,13 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: i
                 steps += other >= 0 and labels[other] != labels[work.star[i]]
     if b >= 0 and n_outer <= 2:  # a ring of cells, possibly closed by the outside: each of its arcs is a fan
         return steps + n_outer - 2 * n_labels
-    is_open, excess = _link(dual, a, b, count, work), 0
+    is_open = _link(dual, a, b, count, work)
+    n_fans = _join_fans(dual, count, is_open, work)
     if n_labels == 2 and not is_open:  # cells without the one label have the other
-        return 2 * (_fans(dual, count, 0, is_open, work) - 2)
+        return 2 * (n_fans - 2)
+    excess = n_fans - 2 * n_labels
     for own in range(n_labels):
-        excess += _fans(dual, count, own, is_open, work) - 2
+        excess += _rest_fans(n_fans, own, is_open, work)
     return excess
 
 
@@ -846,25 +854,58 @@ def _has_false_contact(dual: Dual, count: int, n_labels: int, work: _Work) -> bo
 
 
 @helper
-def _fans(dual: Dual, count: int, own: int, is_open: bool, work: _Work) -> int:
-    """Fans of a label's cells in a star and of all others including the outside, linked by facets around it."""
-    root, n_fans = work.root, count  # the last of the roots is the outside's
-    for i in range(count + 1):
+def _join_fans(dual: Dual, count: int, is_open: bool, work: _Work) -> int:
+    """Number of fans of single labels in a star; also store the label of each, and which of them are linked.
+
+    The outside follows as a further one, without a label.
+    """
+    root, n_fans = work.root, 0
+    for i in range(count):
         root[i] = i
     for i in range(count):
         for k in range(dual.cells.shape[1]):
             j = work.beside[i, k]
-            if j < i or (work.own[i] == own) != (j < count and work.own[j] == own):
-                continue
-            p, q = i, j
-            while root[p] != p:
-                p = root[p]
-            while root[q] != q:
-                q = root[q]
-            if p != q:
-                root[p] = q
-                n_fans -= 1
-    return n_fans + 1 if is_open else n_fans
+            if i < j < count and work.own[i] == work.own[j]:
+                p, q = _root(root, i), _root(root, j)
+                root[max(p, q)] = min(p, q)  # a root comes first
+    for i in range(count):
+        if root[i] == i:
+            work.fan[i], work.fan_label[n_fans] = n_fans, work.own[i]
+            n_fans += 1
+        else:
+            work.fan[i] = work.fan[root[i]]
+    n_linked = n_fans + 1 if is_open else n_fans
+    work.fan[count], work.fan_label[n_fans] = n_fans, -1
+    work.is_linked[:n_linked, :n_linked] = False
+    for i in range(count):
+        for k in range(dual.cells.shape[1]):
+            if work.beside[i, k] >= 0:
+                p, q = work.fan[i], work.fan[work.beside[i, k]]
+                work.is_linked[p, q] = work.is_linked[q, p] = True
+    return n_fans
+
+
+@helper
+def _root(root: NDArray, i: int) -> int:
+    while root[i] != i:
+        i = root[i]
+    return i
+
+
+@helper
+def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
+    """Fans of all that has not a label, including the outside; of the fans that `_join_fans` stored."""
+    root, n_linked = work.root, n_fans + 1 if is_open else n_fans
+    count = 0
+    for p in range(n_linked):
+        root[p] = p
+        count += work.fan_label[p] != own
+        for q in range(p if work.fan_label[p] != own else 0):
+            if work.is_linked[p, q] and work.fan_label[q] != own:
+                i, j = _root(root, p), _root(root, q)
+                count -= i != j
+                root[i] = j
+    return count
 
 
 @entry
