@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from tetopt import Image, InputError, Mesh, cell_labels, cell_moments, load_image, load_mesh
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
 from tetopt.report.figures import save_figure
-from tetopt.report.scene import Draw, cutaway, put_scene
-from tetopt.report.viewer import View, view_of
+from tetopt.report.scene import Draw, View, cutaway, put_scene, view_of
 from tetopt.system.files import checked_output
 
 

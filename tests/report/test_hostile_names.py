@@ -16,7 +16,6 @@ from tetopt.model.labels import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.explore import save_explorer
 from tetopt.report.page import PAGE_SCRIPTS, picture_html, policy_html, script_html, write_page
-from tetopt.report.viewer import View, views_html
 from tetopt.study.paper_files import _write_page
 
 pytestmark = pytest.mark.deep
@@ -81,13 +80,11 @@ def test_the_page_to_explore(mesh, image, server, tmp_path):
     check_shown(tmp_path / "a.html", server[1], [*names, *(f"{name} 6" for name in names)])
 
 
-def test_the_page_of_pictures_and_views(mesh, server, tmp_path):
+def test_the_page_of_pictures(server, tmp_path):
     names = hostile(server[0])
-    outside = boundary_facets(mesh.cells)
-    views = [View(name, mesh.points, outside, np.arange(len(outside), dtype=float)) for name in names[:3]]
     PIL.Image.fromarray(np.zeros((2, 2), dtype=np.uint8)).save(tmp_path / "p.png")
     pictures = [picture_html(tmp_path / "p.png", name) for name in names]
-    write_page(tmp_path / "a.html", names[0], "".join([*pictures, views_html(views)]))
+    write_page(tmp_path / "a.html", names[0], "".join(pictures))
     check_shown(tmp_path / "a.html", server[1], names)
 
 

@@ -70,9 +70,6 @@ class ShownOptions:
     """View settings of `tetopt view`, and its outputs."""
 
     html: Annotated[Path | None, Option("OUT.html", "Write the page to this file; open no browser.")] = None
-    screenshot: Annotated[Path | None, Option("OUT.png", "Write the initial view as a picture; open no browser.")] = (
-        None
-    )
     field: Annotated[
         str | None, Option("NAME", "Field to colour by initially: mean, label, von_mises, ... (default: the first).")
     ] = None

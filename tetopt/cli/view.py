@@ -40,7 +40,6 @@ def view_command(
     A mesh with displacements is drawn deformed, scaled by a slider; quadratic cells are drawn by their corners.
     """
     html = None if how.html is None else checked_output(how.html, (".html",), force)
-    screenshot = None if how.screenshot is None else checked_output(how.screenshot, (".png",), force)
     limits = None if how.limits is None else _limits(how.limits)
     mesh_path, image_path = mesh_and_image(paths, image_path)
     loaded = read_mesh(mesh_path)
@@ -55,25 +54,14 @@ def view_command(
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
-    from tetopt.report.exhibit import (  # matplotlib and pyvista load slowly and are needed only here
-        exhibit,
-        opened_on,
-    )
+    from tetopt.report.exhibit import exhibit, opened_on  # matplotlib and pyvista load slowly and are needed only here
+    from tetopt.report.explore import save_explorer
 
     shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table)
-    shown = opened_on(shown, how.field or _only_labels(loaded), limits)
-    if screenshot is not None:
-        from tetopt.report.scene import opened_mesh, save_scenes
-
-        save_scenes(screenshot, [("", opened_mesh(shown))])
-        print_line(str(screenshot))
-    if html is not None or screenshot is None:
-        from tetopt.report.explore import save_explorer
-
-        page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
-        save_explorer(page, shown)
-        words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
-        print_line(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained")
+    page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
+    save_explorer(page, opened_on(shown, how.field or _only_labels(loaded), limits))
+    words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
+    print_line(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained")
     return 0
 
 

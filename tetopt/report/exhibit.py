@@ -1,4 +1,4 @@
-"""Contents of `tetopt view`, for a page (`tetopt.report.explore`) or picture (`tetopt.report.scene.opened_mesh`)."""
+"""Contents of the page of `tetopt view` (`tetopt.report.explore`)."""
 
 from __future__ import annotations
 

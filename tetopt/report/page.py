@@ -20,7 +20,6 @@ from tetopt.system.files import save_text
 
 # The script files of each page, in this folder.
 PAGE_SCRIPTS = {
-    "viewer": ("webgl.js", "viewer.js"),
     "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),
     "cohort": ("cohort.js",),
 }

@@ -4,30 +4,69 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyvista
-from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tetopt.geometry.topology import boundary_facets
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import centroids
+from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import LISTED_LABELS, grey_limits, plain_text
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
+from tetopt.report.colours import grey_limits
 from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
-from tetopt.report.viewer import View
 from tetopt.system.files import check_suffix, written_whole
 
 STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # position of the camera, RAS: on the right, in front and above
-GLASS_OPACITY = 0.6  # of the cells' colours over the image: colours are distinct, and voxels remain visible
-ABOVE_IMAGE = 1e-3  # distance of the cells in a section from the image there, as a fraction of the mesh's extent
 SCENE_ZOOM = 1.05  # times the size at which the scene surely fits
-BAR_FRACTION, LEGEND_FRACTION = 0.1, 0.2  # of the picture's width, for a colour bar or legend beside the scene
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
+
+
+class View(NamedTuple):
+    """A triangle surface to view."""
+
+    title: str
+    points: NDArray[np.float64]  # (N, 3) world mm
+    triangles: NDArray[np.int64]  # (K, 3), normals pointing out
+    values: NDArray[np.float64]  # (K,) of each triangle's cell, drawn in grey
+
+
+def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None) -> View:
+    """Return the surface of a mesh without its right, front, upper octant, which shows the inside.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Tetrahedra.
+    means : (M,) float64
+        The value of each cell; a triangle gets that of its cell.
+    title : str
+    centre : (3,) float64, optional
+        Corner of the octant, world mm; by default the middle of the mesh's box. Cells whose centroids lie beyond it are
+        removed whole; if that would be all cells, none is removed.
+
+    Raises
+    ------
+    InputError
+        The mesh has triangles, or the number of means is not that of cells.
+    """
+    if mesh.ndim != 3:
+        raise InputError(f"{title}: expected a tetrahedral mesh, got triangles")
+    if len(means) != len(mesh.cells):
+        raise InputError(f"{title}: expected one mean for each of {len(mesh.cells)} cells, got {len(means)}")
+    if centre is None:
+        centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
+    is_kept = (centroids(mesh.points, mesh.cells) <= centre).any(axis=1)
+    if not np.any(is_kept):
+        is_kept = np.full(len(mesh.cells), True)
+    cells, values = mesh.cells[is_kept], np.asarray(means, dtype=np.float64)[is_kept]
+    sides = facets(cells)
+    used, triangles = np.unique(boundary_facets(cells), return_inverse=True)
+    return View(title, mesh.points[used], triangles.reshape(-1, 3), values[sides.cells[sides.n_cells == 1, 0]])
 
 
 def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
@@ -56,7 +95,7 @@ def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
     """Draw a scene in the plotter's current part, and move the camera to the viewpoint of all scenes."""
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
-    plotter.camera.zoom(SCENE_ZOOM * (1.0 - abs(plotter.camera.GetWindowCenter()[0])))
+    plotter.camera.zoom(SCENE_ZOOM)
 
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
@@ -101,101 +140,6 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
         surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
         line_width=1, ambient=0.3,
     )  # fmt: skip
-
-
-def opened_mesh(shown: Exhibit) -> Draw:
-    """Return the initial scene of `tetopt view`: the mesh cut across its middle, coloured by its first field.
-
-    The image is drawn in the cut. A mesh with displacements is drawn deformed, without the undeformed image.
-    """
-    field, (factor, _) = shown.fields[0], warp_factors(shown)
-    u = next(iter(shown.displacements.values()), None)
-    points = shown.mesh.points if u is None else shown.mesh.points + factor * u
-    image = shown.image if u is None else None
-    axis = first_axis(shown)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: shown.mesh.cells}, points)
-    look: dict[str, Any] = {"scalars": "value", "show_scalar_bar": False, "show_edges": True, "edge_color": MESH_LINE}
-    if field.categories:
-        grid.cell_data["value"] = _label_colours(field)
-        look["rgb"] = True
-    else:
-        (grid.cell_data if field.nodes is None else grid.point_data)["value"] = (
-            field.values if field.nodes is None else field.nodes
-        )
-        look |= {"cmap": COLOUR_MAP, "clim": field.limits, "nan_color": NO_VALUE}
-
-    def draw(plotter: pyvista.Plotter) -> None:
-        plotter.enable_parallel_projection()  # keeps all of it in the picture
-        plotter.camera.SetWindowCenter(LEGEND_FRACTION if field.categories else BAR_FRACTION, 0.0)
-        plane = {"normal": np.eye(3)[axis], "origin": middle}
-        behind, section = grid.extract_surface(algorithm="dataset_surface").clip(**plane), grid.slice(**plane)
-        if behind.n_cells:
-            plotter.add_mesh(behind, ambient=0.2, **look)
-        if section.n_cells:
-            # Nearer to the camera than the image, which would hide it where both are equally near.
-            glass = section.translate(ABOVE_IMAGE * np.ptp(points, axis=0).max() * plane["normal"])
-            plotter.add_mesh(glass, lighting=False, opacity=1.0 if image is None else GLASS_OPACITY, **look)
-        if image is not None:
-            plotter.add_mesh(
-                plane_slice(image, axis, middle[axis]), scalars="h", cmap="gray", lighting=False,
-                clim=grey_limits([image.data.astype(np.float64)]), show_scalar_bar=False,
-            )  # fmt: skip
-        _add_key(plotter, field)
-
-    return draw
-
-
-def _label_colours(field: Field) -> NDArray[np.uint8]:
-    """Return the red, green and blue of each cell's label (M, 3); `NO_VALUE` for values that are not labels."""
-    colours = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(field.values), 1))
-    for label, colour in field.categories:
-        colours[field.values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
-    return colours.astype(np.uint8)
-
-
-def _add_key(plotter: pyvista.Plotter, field: Field) -> None:
-    """Add a colour bar, or a legend of the labels with most cells."""
-    title = plain_text(f"{field.name} ({field.unit})" if field.unit else field.name)
-    if not field.categories:
-        mapper = pyvista.DataSetMapper()
-        mapper.lookup_table = pyvista.LookupTable(COLOUR_MAP, scalar_range=field.limits)
-        plotter.add_scalar_bar(
-            title=title, mapper=mapper, color="black", fmt="%.4g", vertical=True, position_x=0.86, position_y=0.63,
-            height=0.35, width=0.06, title_font_size=18, label_font_size=16, render=False,
-        )  # fmt: skip
-        return
-    most = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))[:LISTED_LABELS]
-    entries = [
-        [plain_text(f" {label} {field.names.get(label, '')}".rstrip()), colour] for label, colour in sorted(most)
-    ]
-    if len(field.categories) > LISTED_LABELS:
-        entries.append([f" and {len(field.categories) - LISTED_LABELS} more", "#555555"])
-    plotter.add_legend(entries, bcolor="white", face="rectangle", size=(0.2, 0.03 * len(entries)))
-
-
-def plane_slice(image: Image, axis: int, at: float) -> pyvista.PolyData:
-    """Return the image in a world plane: a polygon for each voxel that the plane cuts.
-
-    Parameters
-    ----------
-    image : Image
-        Three-dimensional.
-    axis : int
-        World axis normal to the plane, 0 for R-L, 1 for A-P, 2 for S-I.
-    at : float
-        Position of the plane on this axis, mm.
-
-    Returns
-    -------
-    pyvista.PolyData
-        World coordinates, mm, with cell data `h`, the voxels' values.
-    """
-    voxels = pyvista.ImageData(dimensions=np.array(image.shape) + 1, origin=(-0.5, -0.5, -0.5))
-    voxels.cell_data["h"] = image.data.ravel(order="F")
-    # The index of a point in the plane; halfway between two layers of voxels the upper one is shown.
-    inside = np.linalg.inv(image.affine[:3, :3])[:, axis] * (at - image.affine[axis, 3]) + 1e-6
-    return voxels.slice(normal=image.affine[axis, :3], origin=inside).transform(image.affine, inplace=False)
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:

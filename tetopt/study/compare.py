@@ -393,7 +393,7 @@ def _check_resumable(folder: Path, comparison: Comparison) -> None:
 def _peers() -> dict[str, str]:
     """Return the versions of the installed peers."""
     installed = {}
-    for name in ("pytetwild", "itk-cleaver"):
+    for name in ("pytetwild",):
         with contextlib.suppress(PackageNotFoundError):
             installed[name] = version(name)
     return installed

@@ -19,8 +19,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits, plain_text
 from tetopt.report.figures import SliceView, draw_edges, fill_cells
-from tetopt.report.scene import cutaway, save_scenes
-from tetopt.report.viewer import view_of
+from tetopt.report.scene import cutaway, save_scenes, view_of
 from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
 

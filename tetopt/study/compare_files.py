@@ -17,7 +17,6 @@ from tetopt.mesh import Mesh
 from tetopt.model.labels import table_of_labels
 from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
-from tetopt.report.viewer import view_of
 from tetopt.study import compare
 from tetopt.study.compare_figures import (
     curves_figure,
@@ -136,6 +135,4 @@ def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[int
     for name, figure in figures.items():
         save_figure(figure, paths[name])
     pictures = [(paths[name], caption) for name, caption in COMPARE_PICTURES.items() if name in drawn]
-    turned = [k for k, name in enumerate(meshes[1]) if shown[name].kind != "control"] or [0]
-    views = [view_of(titled[1][k][1], means[1][k], titled[1][k][0]) for k in turned]
-    save_compare_page(paths["report.html"], report, pictures, views)
+    save_compare_page(paths["report.html"], report, pictures)

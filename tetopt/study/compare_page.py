@@ -15,7 +15,6 @@ import numpy as np
 from markupsafe import Markup
 
 from tetopt.report.page import package_text, rendered, write_page
-from tetopt.report.viewer import View, views_html
 from tetopt.study.compare_criteria import (
     GROUPS,
     Criterion,
@@ -47,7 +46,7 @@ GROUP_PICTURES = {  # stems of pictures' names, by the group of their section
 }
 
 
-def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path, str]], views: Sequence[View]) -> None:
+def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path, str]]) -> None:
     """Write the comparison as one HTML file without outside references, whole or not at all.
 
     Parameters
@@ -58,22 +57,19 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
         from them, and nothing is measured here.
     pictures : sequence of (PNG path, caption)
         Each is shown in its section of `GROUP_PICTURES`.
-    views : sequence of View
-        Surfaces to rotate; without any, the section is left out.
     """
     content = rendered(
         "study/compare.html", report=report, first=headline(report), nus=fem_ratios(report), order_words=ORDER_WORDS,
         groups=[_group(report, name) for name in GROUPS], labels=labels_of(report),
         shown=lambda stems: [each for stem in stems for each in pictures if Path(each[0]).stem == stem],
-        best_variants=list(_best_variants(report)), equal_times=equal_times(report), views=views_html(views),
+        best_variants=list(_best_variants(report)), equal_times=equal_times(report),
         orders=[(order, of_order(report, order)) for order in ORDER_WORDS], untimed=UNTIMED_STEPS,
         machine=", ".join(f"{key} {_text(value)}" for key, value in report.machine.items()),
         pipelines=[[each.title, each.about] for each in report.pipelines],
         options=[[name, _text(value)] for name, value in report.options._asdict().items()],
         number_text=number_text, short_text=short_text, text=_text, winners=winners, numbered=_numbered,
     )  # fmt: skip
-    style = package_text("study/compare.css") + package_text("report/viewer.css")
-    write_page(path, f"tetopt compared on {report.image.source.name}", content, style)
+    write_page(path, f"tetopt compared on {report.image.source.name}", content, package_text("study/compare.css"))
 
 
 def _numbered(content: str) -> Markup:

@@ -106,9 +106,7 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
 class BaselineOptions:
     """Options of a conventional mesh."""
 
-    pipeline: Annotated[Literal["pytetwild", "cleaver"], Option(None, "The mesher of the conventional pipeline.")] = (
-        "pytetwild"
-    )
+    pipeline: Annotated[Literal["pytetwild"], Option(None, "The mesher of the conventional pipeline.")] = "pytetwild"
     nodes: Annotated[int, Option("N", "Target number of nodes.", least=20)] = DEFAULT_NODES[3]
     labels: Annotated[Path | None, Option("LABELS", "Label image instead of a segmentation of IMAGE.")] = None
     classes: ClassesOption = DEFAULT_SETTINGS.classes

@@ -1,4 +1,4 @@
-"""Seven pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
+"""Six pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.cleaver import INSTALL_HINT, stuffed
-from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
+from tetopt.study.interfaces import OTSU_CLASSES, interfaces
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.system.extras import install_hint
@@ -144,22 +143,6 @@ def pytetwild(job: PipelineInput) -> Produced:
     return _searched(result, seconds, surfaces.notes)
 
 
-def cleaver(job: PipelineInput) -> Produced:
-    """Run Cleaver's lattice stuffing on labels, given or by thresholds; see `cleaver`.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.study.cleaver.stuffed`.
-    """
-    seconds: dict[str, float] = {}
-    with _timed(seconds, "labels"):
-        labels = class_labels(job.image, job.classes) if job.labels is None else job.labels
-    with _timed(seconds, "tetrahedra"):
-        result = stuffed(job.image, labels, job.nodes, job.order)
-    return _searched(result, seconds, [])
-
-
 def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
     """Return a peer's result, with the search for the number of nodes as a separate step."""
     seconds["tetrahedra"] -= result.search_seconds
@@ -181,8 +164,7 @@ class Pipeline(NamedTuple):
     @property
     def missing(self) -> str | None:
         """How to install what the pipeline needs and this machine lacks, in words."""
-        is_there = all(find_spec(package.partition(".")[0]) and find_spec(package) for package in self.packages)
-        return None if is_there else f"{self.title}: not installed; {self.hint}"
+        return None if all(map(find_spec, self.packages)) else f"{self.title}: not installed; {self.hint}"
 
 
 PIPELINES = {
@@ -202,9 +184,6 @@ PIPELINES = {
         "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
         pytetwild, is_random=True, packages=("pytetwild",),
         hint=f"install it with: {install_hint('compare', 'pytetwild')}",
-    ),
-    "cleaver": Pipeline(
-        "itk-cleaver", "peer", "the same labels, Cleaver", cleaver, packages=("itk.CleaverPython",), hint=INSTALL_HINT
     ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
     "odt": Pipeline(

@@ -37,8 +37,7 @@ from tetopt.study.search import Response, corners_for, is_near, tries
 from tetopt.system.extras import install_hint
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
-# Response to the factor: measured slopes are -3 to -9. Cleaver, which shares it, crashes on coarse meshes.
-TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)
+TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)  # measured slopes are -3 to -9
 ENVELOPE_FRACTION = 0.2  # distance that fTetWild may move a surface, over the edge of regular cells, at factor 1
 ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, with small factors, are met closely
 EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces

@@ -46,8 +46,8 @@ def pip_install(*requirements: str) -> str:
 
     Examples
     --------
-    >>> pip_install("itk-cleaver", "numpy<2")
-    'pip install "itk-cleaver" "numpy<2"'
+    >>> pip_install("pytetwild", "numpy<2")
+    'pip install "pytetwild" "numpy<2"'
     """
     return " ".join(["pip install", *(f'"{requirement}"' for requirement in requirements)])
 
