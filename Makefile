@@ -34,7 +34,7 @@ test-deep: $(VENV)/.test
 	$(TESTED) -q -m "deep and not slow" $(ALL_CORES)
 	$(MAKE) --no-print-directory -j 2 test-onethread test-nojit
 
-# Whether tests see the faults of tests/mutants: an hour.
+# Whether tests see the faults of tests/mutants: an hour and a half.
 test-mutants: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/mutants/run.py
 

@@ -175,6 +175,17 @@ def test_two_dimensions():
     np.testing.assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
+def test_a_label_that_falls_between_voxels_of_its_size_is_told():
+    """A voxel in the middle of a cell of the grid turned by 45 degrees."""
+    labels, affine = np.ones((5, 5)), np.eye(3)
+    labels[2, 2] = 3.0
+    affine[:2, :2] = np.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]])
+    affine[:2, 2] = 2.0 - affine[:2, :2] @ [3.5, 3.5]
+    with pytest.warns(UserWarning, match=r"l: .* label 3 loses 100% of its volume \(1 mm2\)"):
+        moved = resample_labels(tetopt.Image(labels), tetopt.Image(np.zeros((8, 8)), affine), "l")
+    assert set(moved.data.ravel()) == {0.0, 1.0}
+
+
 @pytest.mark.parametrize(
     ("values", "expected"),
     [

@@ -86,6 +86,14 @@ def test_labels_are_one_hot():
     assert codes[17].max() > 3.0 * codes[3].max()  # by the voxel the rare one counts more
 
 
+@pytest.mark.parametrize("weight", [0.25, 4.0])
+def test_labels_count_by_their_weight(weight):
+    labels = labelled()
+    target = content(labels, labels, weights=[0.0], label_weight=weight)
+    variance = target.unit * sum(np.var(v, dtype=np.float64) for v in target.values)
+    assert variance == pytest.approx(weight * float(np.var(labels.data, dtype=np.float64)), rel=2e-3)
+
+
 def test_labels_that_touch_only_in_a_point_are_told_apart():
     labels = np.zeros((8, 8, 8))
     labels[:4, :4, :4], labels[4:, 4:, 4:] = 1, 2
@@ -151,6 +159,15 @@ def test_beyond_a_mask_the_nearest_value_inside_counts():
     np.testing.assert_array_equal(target.region.inside, inside)
     assert target.variance == pytest.approx(float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9)
     assert target.volume == pytest.approx(mask.data.sum() * image.voxel_volume)
+
+
+def test_nearest_is_by_mm():
+    """Of long voxels: three columns of 1 mm are nearer than one row of 10 mm."""
+    mask, data = np.zeros((2, 6)), np.zeros((2, 6))
+    mask[0, 2] = mask[1, 5] = 1.0
+    data[0, 2], data[1, 5] = 7.0, 8.0
+    affine = np.diag([10.0, 1.0, 1.0])
+    assert continued(tetopt.Image(data, affine), tetopt.Image(mask, affine)).data[1, 2] == 8.0
 
 
 def test_noise_within_a_mask():

@@ -253,6 +253,25 @@ def test_each_load_has_its_card_and_steps_begin_anew():
     assert {lines[0][0] for word, _, lines in blocks if word == "*DENSITY"} == {"1e-06", "1.5e-06"}
 
 
+def test_forces_on_one_node_add_up():
+    """Those of two sets that share an edge."""
+    model = loaded_model(["hold:superior", "traction:inferior:0,0,2", "traction:left:0,0,3"])
+    (card,) = (lines for word, _, lines in blocks_of(abaqus(model)) if word == "*CLOAD")
+    total = sum(facet_forces(model.mesh, model.sets, load)[1][:, 2].sum() for load in model.loads[1:])
+    assert sum(float(force) for _, _, force in card) == pytest.approx(total, rel=1e-12)
+    assert len({node for node, _, _ in card}) == len(card)
+
+
+def test_a_nonlinear_law_is_the_linear_one_at_small_strains():
+    """By the manual: shear modulus 2 C10, bulk modulus 2 / D1."""
+    model = loaded_model(["compress:5%"])._replace(is_nonlinear=True)
+    found = re.findall(r"\*HYPERELASTIC, NEO HOOKE\n(\S+), (\S+)\n", abaqus(model).decode())
+    young, nu = model.materials.young, model.materials.nu
+    c10, d1 = np.array(found, dtype=float).T
+    np.testing.assert_allclose(2.0 * c10, young / (2.0 * (1.0 + nu)), rtol=1e-12)
+    np.testing.assert_allclose(2.0 / d1, young / (3.0 * (1.0 - 2.0 * nu)), rtol=1e-12)
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_modulus_that_varies_is_one_that_depends_on_the_temperature(order):
     model = loaded_model(["hold:superior"], order=order, moduli="nodes")

@@ -12,6 +12,7 @@ from models import LOAD_CASES, displaced, loaded_model, sample_model
 from tetopt.errors import InputError
 from tetopt.fem.solution import solve
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.geometry.simplex import volumes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
 from tetopt.model.model import described, elements, in_space, in_units
@@ -216,6 +217,16 @@ def test_units_are_consistent_with_mm():
         assert_same(feb, model)
         assert feb.root.find("Module/units").text == name
         assert {float(element.text) for element in feb.root.iter("density")} == {density}
+
+
+def test_weight_is_in_the_unit_of_forces():
+    """mN or N, of a density in kg/m3."""
+    model = loaded_model(["hold:superior", "gravity:0,0,-9810"])
+    of_cell = model.materials.density[model.materials.of_cell]
+    weight = 9810.0 * 1e-9 * float((of_cell * volumes(model.mesh.points, model.mesh.cells)).sum())
+    for units, factor in (("kPa", 1.0), ("MPa", 1e-3)):
+        data = ET.fromstring(febio(in_units(model, units))).find("MeshData/NodeData")
+        assert sum(numbers(node)[2] for node in data) == pytest.approx(-factor * weight, rel=1e-9)
 
 
 def test_awkward_names():

@@ -4,9 +4,10 @@ from collections import deque
 
 import numpy as np
 import pytest
+from meshes import with_bent_edges
 from models import each_once, labelled_model, quadratic_model, sample_model
 
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import numbered_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.mfem import mfem
 from tetopt.model.materials import materials
@@ -141,6 +142,17 @@ def test_order_2_adds_the_middle_of_each_edge_once(n):
     expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
     assert sorted(read.middles.tolist()) == sorted(expected.tolist())
     assert "point data (not supported by this format): displacement, warmth" in read.comments
+
+
+@pytest.mark.parametrize(("n", "edges"), [(2, "01 12 20"), (3, "01 02 03 12 13 23")])
+def test_middles_are_in_the_order_of_mfem_s_edges(n, edges):
+    """That in which its elements first have them, by the local edges of MFEM's fem/geom.cpp."""
+    model = quadratic_model(n)
+    mesh = with_bent_edges(model.mesh, 0.05)
+    ends = np.sort([[[cell[int(k)] for k in edge] for edge in edges.split()] for cell in mesh.cells], axis=2)
+    number = {tuple(pair): k for k, pair in enumerate(numbered_edges(mesh.cells)[0].tolist())}
+    order = [number[pair] for pair in dict.fromkeys(map(tuple, ends.reshape(-1, 2).tolist()))]
+    assert np.array_equal(Read(mfem(model._replace(mesh=mesh))).middles, mesh.midpoints[order])
 
 
 @pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])

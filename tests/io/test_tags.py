@@ -22,6 +22,7 @@ def test_tags_say_which_sets_an_item_is_in():
             np.testing.assert_array_equal(chosen, members)
         together = {tuple(name for name in sets if tag in tags.tags_of[name]) for tag in np.unique(tags.tags)}
         assert len(together) == tags.tags.max()  # no two tags for one combination
+        assert list(dict.fromkeys(tags.tags.tolist())) == list(range(1, tags.tags.max() + 1))  # as they first occur
     assert tagged({}).tags_of == {}
 
 

@@ -126,6 +126,14 @@ def test_edges_are_those_of_the_labels_own_cells():
     assert row.across == pytest.approx(row.voxels.p50 / row.edge, rel=1e-6)
 
 
+def test_only_voxels_of_the_cells_label_count_as_its_layers():
+    """Cells of label 2 also hold five layers of voxels of label 1, which is 8 mm thick."""
+    image, mesh, of_cell = blocky(slabs(3, 3))
+    wide = np.where(mesh.points[mesh.cells].mean(axis=1)[:, 0] > 2.5, np.maximum(of_cell, 2), of_cell)
+    row = label_layers(tetopt.content(image, image), mesh, wide)[2]
+    assert row.across == pytest.approx(3.0 / np.sqrt(2.0), rel=0.03)
+
+
 def test_percentiles_are_over_the_voxels():
     x, y = np.indices((20, 20))
     size = np.choose(np.searchsorted([6, 16], y, side="right"), [2, 4, 6])
