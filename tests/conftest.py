@@ -81,6 +81,6 @@ def read_here():
             return read(str(path), *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("read_vtk", "read_gmsh", "vtkhdf", "frd"):
+        for name in ("read_vtk", "read_gmsh", "frd"):
             patch.setattr(f"tetopt.io.{name}.read_apart", read_in_place)
         yield

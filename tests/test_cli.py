@@ -454,7 +454,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown image format"),
         ("quality no.vtu", "no such file"),
-        ("quality {disc}", "expected a .vtu, .vtk, .vtkhdf, .msh or .msh2 mesh"),
+        ("quality {disc}", "expected a .vtu, .vtk, .msh or .msh2 mesh"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality", r"Missing argument '\[IMAGE\] MESH'"),

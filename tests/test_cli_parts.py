@@ -72,7 +72,7 @@ def whole(tmp_path_factory, inputs):
 def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, monkeypatch):
     """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
     monkeypatch.setattr(in_parts, "MOST_LOADED", 0)
-    files = ["-o", tmp_path / "b.vtkhdf", "--json", tmp_path / "b.json", "--young", "2 + 0.01*h"]
+    files = ["-o", tmp_path / "b.vtu", "--json", tmp_path / "b.json", "--young", "2 + 0.01*h"]
     command = ["mesh", inputs / "ball.nii", *OF_TWO[:-1], 2, "--worker-gb", 2, *files]
     assert exit_code(*command) == 0
     one, other = whole[1], json.loads((tmp_path / "b.json").read_text())
@@ -82,7 +82,7 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, mo
     assert one["options"]["parts"] == 2
     assert one["prediction"]["task_bytes"] > 1e5
     assert one["memory"].keys() == {"peak_bytes"}
-    loaded = load_mesh(tmp_path / "b.vtkhdf")
+    loaded = load_mesh(tmp_path / "b.vtu")
     direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii"))
     assert np.array_equal(loaded.cell_data["n_voxels"], direct["n_voxels"])
     assert np.array_equal(loaded.cell_data["max"], direct["max"])

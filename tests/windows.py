@@ -149,9 +149,6 @@ convert a.vtu a.vtk --force
 convert a.vtu a.inp --young 3
 convert a.vtu a.feb --young 3 --load compress:1%
 convert a.vtu a.xdmf
-convert a.vtu a.vtkhdf
-convert a.vtkhdf a.vtkhdf2.vtu
-convert a.vtu a.vtkhdf --force
 quality a.vtu --image a.nii.gz --check --json q.json
 segment a.nii.gz a.vtu -o s.nii.gz
 surface a.vtu --boundary -o a.stl

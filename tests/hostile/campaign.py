@@ -52,7 +52,7 @@ def load_everything() -> None:
     modules = [f"tetopt.cli.{module}" for module in app.COMMANDS.values()]
     modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
     modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
-    modules += ["SimpleITK", "pydicom.pixels", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py"]
+    modules += ["SimpleITK", "pydicom.pixels", "PIL.Image", "meshio", "pyvista", "trimesh"]
     modules += ["zarr", "zarr.codecs"]
     for name in modules:
         import_module(name)

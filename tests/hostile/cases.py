@@ -14,7 +14,7 @@ from hostile.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (
-    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".mfem", ".mesh", ".stl", ".ply",
+    ".vtu", ".vtk", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".mfem", ".mesh", ".stl", ".ply",
 )  # fmt: skip
 # What a second mutation meets in a file whose format the first has damaged.
 LOST_FORMAT = (
@@ -279,11 +279,6 @@ def vtu(draw):
     )
     known = (m.xml, m.xml, m.xml, m.array_values, m.array_values, m.payload, m.xml_depth)
     mesh, what = draw.bad(name, (*known, *m.ANY, *m.TEXT) if name == "ascii.vtu" else (*known, *m.ANY))
-    return what, *with_mesh(draw, mesh)
-
-
-def vtkhdf(draw):
-    mesh, what = draw.bad("h.vtkhdf", m.ANY)
     return what, *with_mesh(draw, mesh)
 
 
@@ -710,7 +705,7 @@ def lines(draw):
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
     dicom), "Zarr": (4, zarr_volumes), "pictures": (2, pictures),
-    "VTU": (7, vtu), "VTKHDF": (4, vtkhdf), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
+    "VTU": (7, vtu), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
     "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),

@@ -175,8 +175,6 @@ def _write_meshes():
         _tetopt("convert", "m.vtu", name, "--order", "2")
     _tetopt("fem", "m.vtu", "-o", "solved.vtu")
     _tetopt("mesh", "i.nii", "--slice", "k=5", "--nodes", "40", "--iterations", "1", "-o", "flat.vtu")
-    loaded = tetopt.load_mesh("m.vtu")
-    tetopt.save_mesh("h.vtkhdf", loaded.mesh, loaded.cell_data, {"tetopt": "0.1.0"})
     mesh = meshio.read("m.vtu")
     bare = meshio.Mesh(
         mesh.points, mesh.cells, cell_data={"mean": mesh.cell_data["mean"], "label": mesh.cell_data["label"]}

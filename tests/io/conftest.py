@@ -2,7 +2,7 @@
 
 import pytest
 
-from tetopt.io import frd, pictures, read_dicom, read_gmsh, read_itk, read_vtk, stacks, vtkhdf
+from tetopt.io import frd, pictures, read_dicom, read_gmsh, read_itk, read_vtk, stacks
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def here(monkeypatch, request):
         return
     from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-    for module in (frd, pictures, read_dicom, read_gmsh, read_itk, read_vtk, stacks, vtkhdf):
+    for module in (frd, pictures, read_dicom, read_gmsh, read_itk, read_vtk, stacks):
         monkeypatch.setattr(module, "read_apart", lambda read, path, *rest, **_: read(str(path), *rest))
     window = vtkOutputWindow.GetInstance()
     yield

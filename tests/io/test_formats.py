@@ -5,7 +5,6 @@ import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
-import h5py
 import meshio
 import numpy as np
 import pytest
@@ -115,9 +114,6 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
     assert_whole(tmp_path / f"a{suffix}", model)
     head = text[: text.index(b"CELLS")] if suffix == ".vtk" else text[:80] if suffix == ".stl" else text
     head = head[: head.index(b"end_header")] if suffix == ".ply" else head
-    if suffix == ".vtkhdf":
-        with h5py.File(tmp_path / "a.vtkhdf") as file:
-            head = "".join([*file["VTKHDF/CellData"], *file["VTKHDF/PointData"], *file["VTKHDF/FieldData"]]).encode()
     if suffix == ".vtk":
         head = b"\n".join(re.findall(rb"\n([\x20-\x7e]+ \d+ \d+ (?:double|vtktypeint64|unsigned_char|int))\n", text))
     shown = head.decode()
@@ -142,17 +138,15 @@ def test_braces_in_names_end_no_process(name, tmp_path):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".msh"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
 def test_names_come_back(suffix, tmp_path):
-    """As they were where they are printable text, else as Python escapes them; gmsh has no quotes, HDF5 no slashes."""
+    """As they were where they are printable text, else as Python escapes them; gmsh has no quotes."""
     model = hostile_model(suffix)
     saved(tmp_path / f"a{suffix}", model)
     back = tetopt.load_mesh(tmp_path / f"a{suffix}")
     expected = {name: name for name in KEPT} | SHOWN
     if suffix == ".msh":
         expected['a"b'] = "a'b"
-    if suffix == ".vtkhdf":
-        expected = {name: new.replace("/", "_") for name, new in expected.items()}
     assert {*expected.values()} == back.cell_data.keys() - {"young", "nu", "material"}
     assert {*expected.values()} == back.point_data.keys()
     for name, new in expected.items():
@@ -178,7 +172,7 @@ def test_two_names_never_become_one():
     assert len(columns) == 10
 
 
-@pytest.mark.parametrize("suffix", [".vtk", ".vtkhdf", ".msh", ".feb"])
+@pytest.mark.parametrize("suffix", [".vtk", ".msh", ".feb"])
 def test_names_of_any_length(suffix, tmp_path):
     mesh = sample_model().mesh
     values = np.arange(len(mesh.cells), dtype=float)
@@ -221,7 +215,6 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     heads = {
         ".vtu": b"<?xml", ".vtk": b"# vtk", ".xdmf": b"<?xml", ".msh": b"$MeshFormat\n4.1", ".inp": b"** tetopt",
         ".msh2": b"$MeshFormat\n2.2", ".mfem": b"MFEM", ".mesh": b"MeshVersion", ".stl": b"tetopt", ".ply": b"ply",
-        ".vtkhdf": b"\x89HDF",
     }  # fmt: skip
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
@@ -234,11 +227,8 @@ def test_a_suffix_of_no_format_is_refused(name, tmp_path):
 
 
 def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(tmp_path):
-    with pytest.raises(InputError, match=r"a\.pvtu: cannot write \.pvtu; use \.vtkhdf"):
-        save_mesh(tmp_path / "a.pvtu", sample_model().mesh)
-    assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.PVTU").write_text("<VTKFile/>")
-    with pytest.raises(InputError, match=r"a\.PVTU: cannot read \.pvtu; save the mesh as \.vtkhdf"):
+    with pytest.raises(InputError, match=r"a\.PVTU: cannot read \.pvtu; save the mesh as \.vtu"):
         tetopt.load_mesh(tmp_path / "a.PVTU")
 
 
@@ -404,17 +394,17 @@ def test_data_that_do_not_fit_leave_the_old_file(suffix, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*linear elements")
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".feb"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".xdmf", ".msh", ".feb"])
 def test_integers_are_kept_or_refused(suffix, tmp_path):
     model = sample_model()
     for value in (2**53, 2**53 + 1, 2**63 + 1):
         data = {"a": np.full(len(model.mesh.cells), value, dtype=np.uint64)}
-        if value > (2**63 if suffix in (".vtu", ".vtkhdf", ".xdmf") else 2**53):
+        if value > (2**63 if suffix in (".vtu", ".xdmf") else 2**53):
             with pytest.raises(InputError, match=f"expected integers up to .* in 'a', got {value}"):
                 save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
         else:
             save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
-            if suffix in (".vtu", ".vtk", ".vtkhdf", ".msh"):
+            if suffix in (".vtu", ".vtk", ".msh"):
                 assert int(tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data["a"][0]) == value
 
 

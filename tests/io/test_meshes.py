@@ -438,11 +438,11 @@ def test_a_missing_file(tmp_path, assert_refused):
 @pytest.mark.parametrize("name", ["a.stl", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"expected a \.vtu, \.vtk, \.vtkhdf, \.msh or \.msh2 mesh$")
+    assert_refused(tmp_path / name, r"expected a \.vtu, \.vtk, \.msh or \.msh2 mesh$")
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("name", ["a.vtu", "a.vtk", "a.vtkhdf"])
+@pytest.mark.parametrize("name", ["a.vtu", "a.vtk"])
 @pytest.mark.parametrize(
     "raw",
     [b"", b"\n", b"no mesh at all", bytes(range(256)) * 20, b"<?xml version='1.0'?><html></html>"],

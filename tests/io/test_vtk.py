@@ -19,7 +19,7 @@ from tetopt.model.sets import nodes_of
 pytestmark = pytest.mark.usefixtures("here")
 
 
-@pytest.mark.parametrize("suffix", ["vtu", "vtk", "vtkhdf"])
+@pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])  # a slice has a plane of its own
 @pytest.mark.parametrize("order", [1, 2])
 def test_every_bit_comes_back(tmp_path, suffix, space, n, order):

@@ -22,7 +22,6 @@ from tetopt.io.readback import save_checked
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
-from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
@@ -47,7 +46,6 @@ class Format(NamedTuple):
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
-    ".vtkhdf": Format("VTKHDF, ParaView", vtkhdf, has_quadratic=True, has_node_moduli=True),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
@@ -58,10 +56,10 @@ FORMATS = {
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
-EXACT_INTEGERS = (".vtu", ".vtkhdf", ".xdmf")  # formats of 64-bit integers; others convert large ones to float64
+EXACT_INTEGERS = (".vtu", ".xdmf")  # formats of 64-bit integers; others convert large ones to float64
 MOST_OF_FLOATS = 2**53  # float64 holds all integers up to this one
 # How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
-SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
+SHOWN_NAMES = {".vtk": legacy_name, ".msh": short_name, ".feb": short_name}
 
 
 BUILT_IN = tuple(FORMATS)
@@ -121,8 +119,6 @@ def format_of(path: Path) -> Format:
         The suffix is unknown; the message lists the known ones.
     """
     suffix = path.suffix.lower()
-    if suffix == ".pvtu":
-        raise InputError(f"{path}: cannot write .pvtu; use .vtkhdf, a single file of any size that ParaView reads")
     if suffix not in FORMATS:
         known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
         raise InputError(f"{path}: unknown suffix; known suffixes are {known}")
@@ -135,7 +131,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     The file is read back and compared before it takes its name.
 
     Names of data and of the image are written as `tetopt.io.text.plain` shows them, escaped in XML; gmsh files have
-    apostrophes instead of their quotes, and gmsh, legacy VTK, VTKHDF and FEBio files only their first 240 characters.
+    apostrophes instead of their quotes, and gmsh, legacy VTK and FEBio files only their first 240 characters.
     Names that become equal are numbered, and a warning lists the changes. Replaces an existing file; call
     `tetopt.system.files.checked_output` first.
 

@@ -16,7 +16,6 @@ from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in
-from tetopt.io.vtkhdf import read_vtkhdf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.file import MeshFile, text_in
@@ -34,7 +33,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     Parameters
     ----------
     path : str or Path
-        Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .msh, .msh2.
+        Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .msh, .msh2.
 
     Returns
     -------
@@ -62,7 +61,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     """
     path = regular_file(path, "mesh file")
     if path.suffix.lower() == ".pvtu":
-        raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtkhdf or .vtu in ParaView")
+        raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtu in ParaView")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh")
     try:
@@ -170,7 +169,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 
 def _read_vtk(path: Path) -> Raw:
-    grid = (read_vtkhdf if path.suffix.lower() == ".vtkhdf" else read_vtk)(path)
+    grid = read_vtk(path)
     rows_of_kind = rows_by_kind(np.diff(grid.offsets), grid.cell_types)
     cells = cells_of_rows(grid.connectivity, grid.offsets, rows_of_kind)
     cell_data = {

@@ -1,7 +1,5 @@
 """Meshes and models as VTK files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
-`tetopt.io.vtkhdf` writes the same contents.
-
 Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or quadratic with straight
 edges, with corners first among the points. Data of cells and points are cell data and point data. Materials are cell
 data `young`, `nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell
@@ -40,7 +38,7 @@ from tetopt.system.incoming import json_of
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkUnstructuredGrid
 
-VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf")  # formats that contain a whole model and can be read back
+VTK_SUFFIXES = (".vtu", ".vtk")  # formats that contain a whole model and can be read back
 # Names of field data in tetopt's files, see above.
 FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
 COMPRESSION_LEVEL = 2  # of zlib: files are 3 % larger than with VTK's default, 5, and written in 0.4 of the time
