@@ -19,7 +19,6 @@ from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
 from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
-from tetopt.contents.probabilities import check_tissues, probable_memberships, tissue_labels, warn_of_sums
 from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -202,7 +201,7 @@ class Content(NamedTuple):
 def content(
     images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
-    keep_components: bool = False, keep_volumes: bool = True, tissues: Sequence[Image] | None = None,
+    keep_components: bool = False, keep_volumes: bool = True,
 ) -> Content:  # fmt: skip
     """Combine contrasts, labels and a mask for `mesh_image`, `octree_mesh` or `optimize`.
 
@@ -231,10 +230,6 @@ def content(
     keep_volumes : bool
         Preserve the volume of labels that are thinner than cells by giving them cells that other labels fill more. If
         False, they lose volume.
-    tissues : sequence of Image, optional
-        Probabilities of tissues, 0 to 1 on the same voxels, instead of labels. They become labels 1 to K in this order,
-        and 0 where the remainder to 1 is larger. Interfaces lie where two are equally probable, within voxels
-        (`tetopt.contents.probabilities`). Probabilities that sum to more than 1 are divided by the sum, with a warning.
 
     Returns
     -------
@@ -244,12 +239,13 @@ def content(
     Raises
     ------
     InputError
-        Images of different shapes, invalid weights, labels that are not whole numbers from 0, probabilities outside 0
-        to 1, both labels and tissues, or only images and labels of weight 0.
+        Images of different shapes, invalid weights, labels that are not whole numbers from 0, or only
+        images and labels of weight 0.
 
     See Also
     --------
-    resample_contrast, resample_labels, resample_tissue, resample_mask : Resample images on other voxels.
+    resample_contrast, resample_labels, resample_mask : Resample images on other voxels.
+    tissue_labels : Labels from tissue probabilities.
     foreground_mask : Mask of the foreground.
 
     Examples
@@ -263,9 +259,7 @@ def content(
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
-    tissues = _checked_tissues(tissues, labels)
-    others = {f"tissues, number {number}": tissue for number, tissue in enumerate(tissues, 1)}
-    _check(images, {"labels": labels, "mask": mask, **others}, weights, label_weight, smooth_interfaces)
+    _check(images, {"labels": labels, "mask": mask}, weights, label_weight, smooth_interfaces)
     labels = None if labels is None else checked_labels("labels", labels, is_map=True)
     region, beyond, whole = None, None, images[0]
     if mask is not None:
@@ -273,8 +267,6 @@ def content(
         region = region_of(_part(mask, beyond.part))
         images = [continued(image, beyond) for image in images]
         labels = None if labels is None else continued(labels, beyond)
-        tissues = [continued(tissue, beyond) for tissue in tissues]
-    labels = tissue_labels(tissues) if tissues else labels
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
         raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
@@ -283,7 +275,7 @@ def content(
     members = None
     if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
         factors = supersampling(labels.spacing)
-        members = probable_memberships(tissues, factors) if tissues else memberships(labels, factors)
+        members = memberships(labels, factors)
         if max(factors) > 1:
             images = [finer(image, factors) for image in images]
             region = None if region is None else _finer_region(region, labels, factors)
@@ -349,17 +341,6 @@ def _whole_numbers(
     for row, code in zip(values[len(contrasts) :], codes, strict=True):
         row[:] = np.rint(scale * code).astype(np.int32)[number]
     return values, scale
-
-
-def _checked_tissues(tissues: Sequence[Image] | None, labels: Image | None) -> list[Image]:
-    """The checked probabilities of tissues; empty if there are none."""
-    if tissues is None:
-        return []
-    if labels is not None:
-        raise InputError("labels and tissues: expected at most one of them, got both")
-    check_tissues(tissues)
-    warn_of_sums(tissues)
-    return list(tissues)
 
 
 def undivided(what: Content, values: NDArray) -> NDArray:

@@ -128,7 +128,7 @@ def read_source(
     if options.labels is not None:
         finest = {**finest, (options.labels, resample_labels): read_companion(options.labels, options.spacing_mm)}
     image, beside, factors = image_and_others(paths[0], options, finest)
-    labels, table, numbers, tissues, is_own = _labelling(options, image, beside, label_names, numbers)
+    labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
     if labels is not None and is_own and numbers:
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
@@ -141,12 +141,12 @@ def read_source(
         mask = _foreground(image, level, labels)
     balance = balance_of(options)
     if options.weights is None and is_own:
-        whose, used = ("the label image", "labels") if tissues is None else ("one of the tissues", "tissues")
+        whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
         note(f"the image is also {whose}: only the {used} are used")
         balance = balance._replace(weights=[0.0])
     represented = content(
-        contrasts, labels if tissues is None else None, mask, tissues=tissues, **balance._asdict(),
-        keep_components=options.keep_components, keep_volumes=not options.free_volumes,
+        contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components,
+        keep_volumes=not options.free_volumes,
     )  # fmt: skip
     if max(factors) > 1:
         represented = represented._replace(repeats=factors)
@@ -156,7 +156,7 @@ def read_source(
         "images": [path.name for path in paths], "weights": balance.weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
-        **({} if tissues is None else {"tissues": [path.name for path in of_tissues]}),
+        **({} if options.tissues is None else {"tissues": [path.name for path in of_tissues]}),
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({"free_volumes": True} if options.free_volumes else {}),
         **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
@@ -192,7 +192,6 @@ class ReadLabels(NamedTuple):
     labels: Image | None = None
     table: LabelTable = NO_TABLE
     numbers: Mapping[int, int] = {}
-    tissues: list[Image] | None = None  # probabilities; each label is that of the largest
     is_own: bool = False  # whether the image contains nothing else
 
 
@@ -208,7 +207,7 @@ def _labelling(
         if not table.names:
             table = LabelTable(dict(enumerate(volumes, 1)), table.colours)
         is_own = is_alone and options.images[0] in tissue_files(options.tissues)
-        return ReadLabels(tissue_labels(tissues), table, {}, tissues, is_own)
+        return ReadLabels(tissue_labels(tissues), table, {}, is_own)
     if options.labels is None:
         return ReadLabels(table=table)
     labels = beside(options.labels, resample_labels)
