@@ -322,7 +322,7 @@ def test_intensities_are_no_labels(inputs, tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
     command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
     exit_code(*command)
-    assert "elements are too large, or this is not a label image" in " ".join(capsys.readouterr().err.split())
+    assert "smooth-interfaces 0, if this is a label image" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):

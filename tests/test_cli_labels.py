@@ -2,6 +2,7 @@
 
 import json
 
+import nibabel
 import numpy as np
 import PIL.Image
 import pytest
@@ -262,3 +263,27 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     assert exit_code("convert", folder / "named.vtu", tmp_path / "d.inp", "--young", "1+0.1*h") == 0
     assert ", nu 0.45: " not in capsys.readouterr().out  # a label is of many materials
     assert [each for each in tetopt.load_mesh(tmp_path / "a2.vtu").sets.facets if "interface" in each] == [name]
+
+
+def test_one_label_that_is_image_and_labels_is_reported_once_and_without_empty_tables(tmp_path, capsys):
+    path, mesh = tmp_path / "ball.nii", tmp_path / "a.vtu"
+    ball = (np.linalg.norm(np.indices((16, 16, 16)) - 7.5, axis=0) < 5.0).astype(np.uint8)
+    image = nibabel.Nifti1Image(ball, np.eye(4))
+    image.header["xyzt_units"] = 5
+    nibabel.save(image, path)
+    words = ["mesh", path, "--labels", path, "--background", "0", "--nodes", "400", "--iterations", "2", "-o", mesh]
+    assert exit_code(*words) == 0
+    out, err = capsys.readouterr()
+    assert err.count("its unit of length has the unknown code 5") == 1
+    assert exit_code("quality", mesh, "--image", path, "--labels", path) == 0
+    again = capsys.readouterr().out
+    for text in (out, again):
+        assert "thin labels" not in text
+        assert "contact" not in text
+        assert "the foreground's surface" in text
+        assert "the mask's surface" not in text
+    counts = [
+        [line.split()[-1] for line in text.splitlines() if line.startswith("cells without a voxel centre")]
+        for text in (out, again)
+    ]
+    assert counts[0] == counts[1] != []

@@ -526,6 +526,17 @@ def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
         assert load_image(edited(hd, tmp_path / "a.dcm", half)).shape == (7, 8, 13)
 
 
+def test_frames_of_segments_that_lie_far_apart(tmp_path, hd):
+    def far(data, where):
+        frame = data.PerFrameFunctionalGroupsSequence[-1].PlanePositionSequence[0]
+        others = data.PerFrameFunctionalGroupsSequence[0].PlanePositionSequence[0]
+        step = np.array(frame.ImagePositionPatient) - np.array(others.ImagePositionPatient)  # of 4 slices
+        frame.ImagePositionPatient = [*map(float, np.array(frame.ImagePositionPatient) + 10 * step)]
+
+    with pytest.warns(UserWarning, match="frames lie in 4 slices, far apart: 43 slices between them are empty"):
+        assert load_image(edited(hd, tmp_path / "a.dcm", far)).shape == (7, 8, 47)
+
+
 def test_names_and_colours_of_segments(tmp_path, hd):
     """As `--label-names` reads them; from the folder, too. Names that two segments share get numbers."""
     path = segmentation(hd, tmp_path / "a.dcm", blobs())

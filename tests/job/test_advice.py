@@ -7,7 +7,7 @@ from commands import exit_code, numbers_in
 import tetopt
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.job.advice import agreed, of_result, of_sizes, sentences, tell, unmet
+from tetopt.job.advice import agreed, of_empty, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.start.sizes import EdgeRatios, Sizes
@@ -89,6 +89,22 @@ def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
     assert "(ratio in brackets): 5 (0.22), 2 (2.1); allow more nodes" in line
 
 
+def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
+    air = label_of(0, 2.0)._replace(voxels=300, dice=0.1)
+    for word, rows, n_remedies in (
+        ("foreground", [air], 0),
+        ("mask", [air], 2),
+        ("foreground", [air, label_of(2, 2.0)], 1),
+    ):
+        told(*unmet({}, {"labels": rows}, word))
+        text = said()
+        assert text.count("\n") == 2
+        assert text.count("allow more nodes") == n_remedies
+        assert text.count("0 (voxels without a label, enclosed or bright)") == (2 if word == "foreground" else 0)
+    told(*unmet({"labels": "..."}, {"labels": [air._replace(is_lost=True)]}, "foreground"))
+    assert said().endswith("label 0 (voxels without a label, enclosed or bright), of more than 200 voxels\n")
+
+
 def ended(E=0.5, E_D=0.5):
     history = [
         IterationRecord(0, 1.0, 1.0, 1.0, 0.0, False, 1, 1, 0.0),
@@ -105,21 +121,28 @@ def ended(E=0.5, E_D=0.5):
         (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
         (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),
-        (ended(), "graded", None, {"cells_without_voxel": 1}, "1 of 1 cells contain no voxel centre"),
+        (
+            ended(),
+            "graded",
+            120,
+            {"cells_without_voxel": 1},
+            "nodes instead of 120: most cells contain no voxel centre",
+        ),
         (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),
     ],
 )
 def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
-    told(*of_result(result, "fast", mode, 100, nodes, measured, np.ones(2)))
+    told(*of_result(result, "fast", mode, 100, nodes, measured))
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
 
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
-    for slices, words in ((1.5, "reduce `nodes`"), (5.5, "slices are 5.5 mm apart")):
-        told(*of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices])))
+    for slices, words in ((1.5, "reduce `nodes` to about 0"), (5.5, "slices are 5.5 mm apart")):
+        told(*of_empty(ended(), 100, 1, np.array([1.0, 1.0, slices])))
         text = said()
+        assert "1 of 1 cells contain no voxel centre" in text
         assert words in text
         assert ("reduce `nodes`" in text) == (slices < 2.0)
 
@@ -148,10 +171,12 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(rng.normal(size=(20, 20))))
     command = ["mesh", path, "--uniform", "--nodes", "200", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
     assert exit_code(*command) == 0
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
     numbers = numbers_in(tmp_path / "a.json")
     n_empty = int((tetopt.load_mesh(tmp_path / "a.vtu").cell_data["n_voxels"] == 0).sum())
     assert numbers["cells_without_voxel"] == n_empty > 0
     row = next(line for line in out.splitlines() if line.startswith("cells without a voxel centre"))
     assert row.split()[-1] == str(n_empty)
     assert numbers["violated"] == {}
+    n_nodes, n_cells = (numbers["size"][name] for name in ("n_nodes", "n_cells"))
+    assert f"reduce --nodes to about {float(f'{n_nodes * (1 - n_empty / n_cells):.2g}'):.0f}" in err

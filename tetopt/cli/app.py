@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 import tetopt
-from tetopt.cli.console import log, open_streams, print_line, settle_streams, show_error, show_event, show_warning
-from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
+from tetopt.cli.console import open_streams, print_line, say, settle_streams, show_error, show_event, warnings_once
+from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard, tell_end
 from tetopt.errors import FORMER_NAMES, InputError, error_words
 from tetopt.job.events import listened
 from tetopt.system.budget import check_addresses
@@ -85,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)
     open_streams()
     with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard(), listened(show_event):
-        warnings.showwarning = show_warning
+        warnings.showwarning = warnings_once()
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice does not concern the user
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)
     if reason := settle_streams():
@@ -98,7 +97,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     """Run the command and return the exit code; print errors, and the outputs written in spite of them."""
     try:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
-        return _ended_by_signal(outputs) if code in (INTERRUPTED_CODE, signal_code()) else code
+        return tell_end() if code in (INTERRUPTED_CODE, signal_code()) else code
     except (InputError, OSError, MemoryError) as error:
         show_error(_with_option(error_words(error), arguments))
         _say_written(outputs)
@@ -106,7 +105,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     except typer.Exit as ended:
         return ended.exit_code
     except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
-        return _ended_by_signal(outputs)
+        return tell_end()
     except SystemExit:  # typer and rich exit so if the pipe for their help has closed
         return 0
     except Exception as error:
@@ -131,18 +130,10 @@ def _with_option(message: str, arguments: list[str]) -> str:
     return message
 
 
-def _ended_by_signal(outputs: Outputs) -> int:
-    """Print which signal ended the command and which outputs exist; return the exit code."""
-    names = ", ".join(map(str, outputs.written)) or "nothing"
-    written = f"; written: {names}" if outputs.places else ""  # without any, the command has printed what exists
-    log.print(escape(f"ended by {signal_name()}{written}"))
-    return signal_code()
-
-
 def _say_written(outputs: Outputs) -> None:
     """Print the outputs that exist although the command ended early."""
     if outputs.written:
-        log.print(escape(f"written before the error: {', '.join(map(str, outputs.written))}"))
+        say(f"written before the error: {', '.join(map(str, outputs.written))}")
 
 
 def _app(arguments: Sequence[str]) -> typer.Typer:

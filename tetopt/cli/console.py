@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any
 
@@ -192,9 +192,21 @@ def show_event(event: Event) -> None:
         _say(f"tetopt: {plain(in_options(event.text))}", "tetopt:", "bold red")
 
 
-def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Print a warning; replaces `warnings.showwarning`."""
-    _say(f"tetopt: warning: {plain(with_hyphens(str(message)))}", "tetopt: warning:", "yellow")
+def show_warning(message: str) -> None:
+    """Print a warning."""
+    _say(f"tetopt: warning: {plain(with_hyphens(message))}", "tetopt: warning:", "yellow")
+
+
+def warnings_once() -> Callable[..., None]:
+    """Return a replacement of `warnings.showwarning` that prints each text once: a file may be image and labels."""
+    told: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if (text := str(message)) not in told:
+            told.add(text)
+            show_warning(text)
+
+    return show
 
 
 def print_verdict(violated: Iterable[str], words: str) -> None:
@@ -244,11 +256,13 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
     from tetopt.report.tables import contact_table, contacts_in_words, thin_table
 
     names = measured.get("label_names", {})
-    if "labels" in measured:
-        print_table(thin_table(measured["labels"], names))
-    if "contacts" in measured:
-        if (table := contact_table(measured["contacts"], names, ndim)) is not None:
+    tables = (
+        thin_table(measured.get("labels", []), names), contact_table(measured.get("contacts", []), names, ndim)
+    )  # fmt: skip
+    for table in tables:
+        if table is not None:
             print_table(table)
+    if measured.get("contacts"):
         print_line(contacts_in_words(measured["contact_totals"], ndim))
 
 

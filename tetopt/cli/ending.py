@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from tetopt.cli.console import log
+from tetopt.cli.console import log, say
+from tetopt.system.files import present_outputs
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 SIGNAL_CODE = 128  # plus a signal's number: the exit code that shells give to a process it ended
@@ -21,6 +22,7 @@ class _Ending:
     def __init__(self) -> None:
         self.numbers: list[int] = []
         self.is_deferred = False
+        self.is_told = False
 
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
         self.numbers.append(number)
@@ -45,7 +47,7 @@ def signals_heard() -> Iterator[None]:
     """
     before: dict[Any, Any] = {}
     _ending.numbers.clear()
-    _ending.is_deferred = False
+    _ending.is_deferred = _ending.is_told = False
     try:
         for number in SIGNALS:
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
@@ -77,10 +79,16 @@ def is_ended() -> bool:
     return bool(_ending.numbers)
 
 
-def signal_name() -> str:
-    """Return the name of the signal that ended the command."""
-    code = signal_code()
-    return "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name
+def tell_end() -> int:
+    """Print, once, which signal ended the command and which outputs exist; return the exit code."""
+    code, outputs = signal_code(), present_outputs()
+    if not _ending.is_told:
+        _ending.is_told = True
+        name = "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name
+        names = "" if outputs is None else ", ".join(map(str, outputs.written)) or "nothing"
+        # A command without checked outputs has printed what exists.
+        say(f"ended by {name}" + (f"; written: {names}" if outputs is not None and outputs.places else ""))
+    return code
 
 
 def signal_code() -> int:

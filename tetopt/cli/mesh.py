@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
-from tetopt.cli.ending import is_ended, mesh_kept, signal_code
+from tetopt.cli.ending import is_ended, mesh_kept, tell_end
 from tetopt.cli.options import ForceOption, PredictOption
 from tetopt.cli.predict import print_parts, print_prediction
 from tetopt.cli.run import Display
@@ -35,8 +35,9 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
         _print(result)
         display.close()  # the mesh's problems, before the last line
         size = f"{nodes_in_words(result.mesh, result.model.order)}, {len(result.mesh.cells)} cells"
+        code = tell_end() if is_ended() else int(bool(result.violated))
         print_verdict(result.violated, f"{job.output}: {size}")
-        return signal_code() if is_ended() else int(bool(result.violated))
+        return code
 
 
 def _predict(job: Job, display: Display) -> int:
@@ -57,7 +58,7 @@ def _print(result: Result) -> None:
     """
     task, model, measured = result.task, result.model, result.measured
     job = task.plan.job
-    _print_comparison(result, 0 if task.source.is_constant else measured.get("cells_without_voxel", 0))
+    _print_comparison(result, measured.get("cells_without_voxel", 0))
     print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
     if has_model(job) or job.output.suffix.lower() != ".vtu":
         print_model(job.output, model, job)

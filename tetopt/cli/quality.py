@@ -48,8 +48,7 @@ def quality_command(
     if source is not None and came.fit is not None:
         _add_fit(table, came.fit, source, came.left_out, every)
     print_table(table)
-    word = "mask" if source is None else source.mask_word
-    print_fidelity(came.measured, came.loaded.mesh.ndim, word, every)
+    print_fidelity(came.measured, came.loaded.mesh.ndim, came.mask_word, every)
     if check and not came.numbers["problems"]:
         print_line(f"checked: conforming, oriented{_checked_words(came)}")
     wrong = came.tell()
@@ -76,4 +75,4 @@ def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str], e
             f"E_D, fraction of {whose_variance(source.content)}{words}", f"{fit.E_D_fraction_of_variance:.5f}"
         )
     table.add_row("voxels inside", f"{fit.n_voxels} of {source.contrasts[0].data.size}")
-    table.add_row("cells without a voxel", str(fit.n_empty_cells))
+    table.add_row("cells without a voxel centre", str(fit.n_empty_cells))

@@ -105,7 +105,11 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
-        yield "the format defines no analysis step: loads are written as text or not at all"
+        yield (
+            "loads are kept as text, which tetopt convert and fem read"
+            if output.suffix.lower() in VTK_SUFFIXES
+            else "the format defines no analysis step: loads are written as text or not at all"
+        )
     if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:

@@ -33,7 +33,7 @@ COLOUR_WORDS = "Orange is the mesh, blue the outline of the mask, other colours 
 PAGE_COLUMNS = {
     "grid.orientation": "orientation", "grid.spacing_mm": "voxels, mm", "grid.shape": "voxels",
     "size.n_nodes_in_all": "nodes", "quality.max_dihedral": "largest angle", "quality.n_under_10_degrees":
-    "cells with angles below 10 degrees", "cells_without_voxel": "cells without a voxel", "energies.E": "E",
+    "cells with angles below 10 degrees", "cells_without_voxel": "cells without a voxel centre", "energies.E": "E",
     "iterations_done": "iterations", "ended": "ended", "mask.distance_p95_mm": "distance to the mask, mm, 95 %",
     "mask.components": "components of the mask", "mask.mesh_components": "components of the mesh",
     "memory.predicted_bytes": "predicted memory", "image": "image", "versions.tetopt": "version",

@@ -46,6 +46,7 @@ VOXELS = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
 # Tags by which dimensions order frames in space, or segments; others distinguish volumes, such as echoes.
 SPATIAL_DIMENSIONS = (0x00200032, 0x00200037, 0x00209056, 0x00209057, 0x00209113, 0x00209128, 0x0062000B)
 AXIAL_DIRECTIONS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # of rows and columns that are not stated
+MOST_EMPTY = 10  # empty slices between the frames of a segmentation, for each slice with one; more are reported
 ALONE = "put the files of one into a separate folder"
 NO_PLACES = (
     "does not state where its {} frames lie (cine, or an old kind of file); convert it with a program that knows, such "
@@ -545,6 +546,11 @@ def _sparse(
                 notes.append(
                     f"its slices are {length:.4g} mm apart as it states, but its frames {np.diff(along).min():.4g} mm "
                     "or more: those between are empty"
+                )
+            elif (n_empty := int(slices[-1]) + 1 - len(slices)) > MOST_EMPTY * len(slices):
+                notes.append(
+                    f"its frames lie in {len(slices)} slices, far apart: {n_empty} slices between them are empty; "
+                    "check that they are of one scan"
                 )
             return step, slices.astype(np.int64)[ranks]
     raise InputError(

@@ -29,7 +29,8 @@ LENGTH_ROUNDING = 1e-3  # relative: the tolerance of edges to their limits
 TARGETS_MISSED = 0.1  # of the edges: a larger fraction far over their targets is reported
 FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are lost
 ACROSS_MET = 0.9  # of the requested cells across: with fewer, at the label's median, they are reported
-EMPTY_CELLS = 0.02  # of the cells: if more contain no voxel, there are too many for the image
+EMPTY_CELLS = 0.02  # of the cells: if more contain no voxel centre, there are too many for the image
+POCKETS = "voxels without a label, enclosed or bright"  # label 0 where a background was removed
 # Requirements whose sentences ask for smaller cells.
 SMALLER_CELLS: Mapping[str, Literal["smaller"]] = dict.fromkeys(
     ("min_dihedral", "overlap", "mask", "components", "manifold", "labels", "error"), "smaller"
@@ -93,7 +94,7 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
 def unmet(requirements: Mapping[str, str], measured: dict[str, Any], word: str = "mask") -> Iterator[Problem]:
     """Yield violated `requirements` (`tetopt.engine.requirements`), including large labels without cells, and lesser
     deviations from mask and labels. `word` is the name of the meshed region in messages."""
-    of_labels = list(_lost(measured))
+    of_labels = list(_lost(measured, word))
     for name, words in requirements.items():
         if name not in {each.name for each in of_labels}:
             yield Problem(words.replace("the mask", f"the {word}"), name=name, wants=SMALLER_CELLS.get(name))
@@ -116,29 +117,37 @@ def _dropped_words(measured: dict[str, Any]) -> str:
     return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
-def _lost(measured: dict[str, Any]) -> Iterator[Problem]:
-    """Yield labels of more than 200 voxels without a cell, smaller ones, and those of poor volume or overlap."""
-    labels = measured.get("labels", [])
+def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
+    """Yield labels of more than 200 voxels without a cell, smaller ones, and those of poor volume or overlap.
+
+    More nodes are no remedy for label 0 within a foreground: it has the voxels that are no background.
+    """
+    labels, pockets = measured.get("labels", []), {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {}
     lost = [row for row in labels if row.is_lost]
-    words = {row.label: label_words(row.label, measured.get("label_names", {})) for row in labels}
-    large = [words[row.label] for row in lost if row.voxels > LABEL_VOXELS]
-    if large:
-        text = f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels"
-        yield Problem(text, "allow more nodes, or a higher `label_weight`", "labels", "smaller")
+    words = {row.label: label_words(row.label, measured.get("label_names", {}) | pockets) for row in labels}
+
+    def smaller(rows: Iterable[LabelFidelity], remedy: str) -> dict[str, Any]:
+        is_helped = any(row.label not in pockets for row in rows)
+        return {"remedy": remedy, "wants": "smaller"} if is_helped else {}
+
+    if large := [row for row in lost if row.voxels > LABEL_VOXELS]:
+        names = ", ".join(words[row.label] for row in large)
+        text, remedy = f"no cell has label {names}, of more than {LABEL_VOXELS} voxels", "allow more nodes, or a higher"
+        yield Problem(text, name="labels", **smaller(large, f"{remedy} `label_weight`"))
     if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
         yield Problem(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
-    ratios = {row.label: row.mesh_volume / row.volume for row in labels if not row.is_lost and row.mesh_volume > 0.0}
-    far = [label for label, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
-    if far := sorted(far, key=lambda label: -max(ratios[label], 1.0 / ratios[label])):
-        worst = ", ".join(f"{words[label]} ({ratios[label]:.2g})" for label in far)
+    ratios = {row: row.mesh_volume / row.volume for row in labels if not row.is_lost and row.mesh_volume > 0.0}
+    far = [row for row, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
+    if far := sorted(far, key=lambda row: -max(ratios[row], 1.0 / ratios[row])):
+        worst = ", ".join(f"{words[row.label]} ({ratios[row]:.2g})" for row in far)
         count = "1 label has" if len(far) == 1 else f"{len(far)} labels have"
         text = f"{count} more than {VOLUME_RATIO:g} times the volume of their voxels, or less than half"
-        yield Problem(f"{text} (ratio in brackets): {worst}", "allow more nodes", wants="smaller")
-    poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
-    if poor := [label for label in poor if label not in large]:
-        text = f"Dice below {LABEL_DICE} for label {listed(poor, 5)}: elements are too large, or this is "
-        remedy = "allow more nodes, or follow every voxel with `smooth_interfaces` 0"
-        yield Problem(f"{text}not a label image", remedy, wants="smaller")
+        yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
+    poor = [row for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE and row not in large]
+    if poor:
+        names = listed([words[row.label] for row in poor], 5)
+        remedy = "allow more nodes, or follow every voxel with `smooth_interfaces` 0, if this is a label image"
+        yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
 
 
 def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
@@ -157,19 +166,19 @@ def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
 
 
 def of_result(
-    result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
-    spacing: NDArray[np.float64],
-) -> Iterator[Problem]:  # fmt: skip
+    result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any]
+) -> Iterator[Problem]:
     """Yield oddities of results that are valid but probably not intended.
 
-    The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts, and `spacing` (n,)
-    the edges of the image's voxels, mm.
+    The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
         text = f"{n_nodes} nodes instead of {nodes}"
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
             remedy = "set `nodes` to that, or use larger sizes"
             yield Problem(f"{text}: the target sizes need about {needed}", remedy)
+        elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
+            yield Problem(f"{text}: most cells contain no voxel centre", wants="larger")
         elif n_nodes < nodes:
             yield Problem(text, "use more iterations, a `k_D` above 0, or smaller sizes", wants="smaller")
         else:
@@ -184,16 +193,27 @@ def of_result(
     if crowded := measured.get("nodes_of_many_labels"):
         text = f"more than {MOST_MEETING} labels meet at {crowded} nodes; only the first {MOST_MEETING} determine"
         yield Problem(f"{text} where these nodes lie")
-    n_empty = measured.get("cells_without_voxel", 0)
-    if n_empty > EMPTY_CELLS * len(result.mesh.cells):
-        text = (
-            f"{n_empty} of {len(result.mesh.cells)} cells contain no voxel centre: these contribute nothing to E_D and "
-            "take the nearest voxel's value"
-        )
-        if spacing.max() >= THICK_SLICES * spacing.min():
-            yield Problem(f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them")
-        else:
-            yield Problem(text, "reduce `nodes`", wants="larger")
+
+
+def has_most_empty(result: MeshingResult, n_empty: int) -> bool:
+    """Return whether `n_empty` cells, which contain no voxel centre, are more than half of all."""
+    return 2 * n_empty > len(result.mesh.cells)
+
+
+def of_empty(result: MeshingResult, n_nodes: int, n_empty: int, spacing: NDArray[np.float64]) -> Iterator[Problem]:
+    """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm."""
+    n_cells = len(result.mesh.cells)
+    if n_empty <= EMPTY_CELLS * n_cells:
+        return
+    text = (
+        f"{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D and take the nearest "
+        "voxel's value"
+    )
+    if spacing.max() >= THICK_SLICES * spacing.min():
+        yield Problem(f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them")
+    else:
+        fewer = float(f"{n_nodes * (1.0 - n_empty / n_cells):.2g}")
+        yield Problem(text, f"reduce `nodes` to about {fewer:.0f}", wants="larger")
 
 
 def tell_label_sizes(made: SizesByLabel) -> None:

@@ -48,6 +48,12 @@ class Judgement(NamedTuple):
         return was_masked or is_masked or MASK_TEXT in self.loaded.field_data
 
     @property
+    def mask_word(self) -> str:
+        """The name of the meshed region in messages, as in the run that built the mesh."""
+        is_given = self.source is not None and self.source.about["inputs"]["mask"] is not None
+        return "mask" if is_given or self.loaded.table("inputs").get("background") is None else "foreground"
+
+    @property
     def is_filled(self) -> bool:
         """True if the mesh should fill the image's box: neither built within a mask nor from another mesh."""
         return not self.is_masked and self.loaded.table("options").get("start") is None
@@ -92,7 +98,7 @@ class Judgement(NamedTuple):
             measured = self.measured
             if not self.is_checked:  # only what makes the numbers meaningless
                 requirements, measured = {name: words for name, words in requirements.items() if name == "mask"}, {}
-            problems += unmet(requirements, measured, self.source.mask_word)
+            problems += unmet(requirements, measured, self.mask_word)
         return agreed([*problems, *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", []))])
 
 

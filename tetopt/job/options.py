@@ -154,7 +154,7 @@ class RegionOptions:
         Option("W", "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
     ] = None
     free_volumes: Annotated[
-        bool, Option(None, "Let labels thinner than cells lose volume, which is preserved by default.")
+        bool, Option(None, "Do not make up for the volume that labels thinner than cells lose (by default, in part).")
     ] = False
     label_weight: Annotated[
         float | None, Option("W", "Weight of the labels relative to the first IMAGE (default 1).")

@@ -10,7 +10,19 @@ from typing import Any, NamedTuple
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import error_words
 from tetopt.geometry.quadratic import node_count
-from tetopt.job.advice import Problem, agreed, failures, of_layers, of_result, of_sizes, sentences, tell, unmet
+from tetopt.job.advice import (
+    Problem,
+    agreed,
+    failures,
+    has_most_empty,
+    of_empty,
+    of_layers,
+    of_result,
+    of_sizes,
+    sentences,
+    tell,
+    unmet,
+)  # fmt: skip
 from tetopt.job.events import Listener, listened
 from tetopt.job.in_parts import end_parts
 from tetopt.job.job import Job
@@ -163,15 +175,16 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     task, came, measured = result.task, result.meshed, result.measured
     problems = list(unmet(came.result.violated, measured, task.source.mask_word))
     problems += failures(failed, problems)
-    if task.source.is_constant:
-        measured = {**measured, "cells_without_voxel": 0}  # whose values are right anyway
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
+    n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
+    empty = list(of_empty(came.result, n_nodes, n_empty, spacing))
+    problems = [*empty, *problems] if has_most_empty(came.result, n_empty) else [*problems, *empty]
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
-    problems += of_result(came.result, job.method, mode, n_nodes, expected, measured, spacing)
+    problems += of_result(came.result, job.method, mode, n_nodes, expected, measured)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
         problems += of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     return agreed(problems)

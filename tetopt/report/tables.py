@@ -194,16 +194,18 @@ def _decimals(number: float, count: int) -> str:
     return f"{number:.{count}f}" if np.isfinite(number) else "-"
 
 
-def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
+def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table | None:
     """Return a table of the `WORST_ROWS` labels with the largest one-layer fraction, worst first, then thinnest.
 
-    Label 0 is not a tissue and is omitted.
+    Label 0 is not a tissue and is omitted, as are labels without a thickness; None if none is left.
     """
+    there = [row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL and row.thickness_voxels is not None]
+    if not there:
+        return None
     table = _table_of_labels(
         "in one\nlayer, %", "thickness of\nvoxels, mm", "of cells,\nmm", "edges,\nmm", "cells\nacross"
     )
     table.columns[0].header = "thin labels"
-    there = [row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL]
 
     def goodness(row: LabelFidelity) -> tuple[float, float, int]:
         return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label

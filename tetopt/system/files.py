@@ -63,6 +63,11 @@ def outputs_of_command() -> Iterator[Outputs]:
                 folder.rmdir()
 
 
+def present_outputs() -> Outputs | None:
+    """Return the outputs of the command that runs; None outside of one."""
+    return _OUTPUTS.get()
+
+
 @contextmanager
 def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
     """Do the same as `outputs_of_command` for a run with these options outside a command."""
