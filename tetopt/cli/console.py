@@ -199,11 +199,11 @@ def show_warning(message: str) -> None:
 
 def warnings_once() -> Callable[..., None]:
     """Return a replacement of `warnings.showwarning` that prints each text once: a file may be image and labels."""
-    told: set[str] = set()
+    shown: set[str] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if (text := str(message)) not in told:
-            told.add(text)
+        if (text := str(message)) not in shown:
+            shown.add(text)
             show_warning(text)
 
     return show
