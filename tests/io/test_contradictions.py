@@ -224,6 +224,8 @@ NRRDS = {
     ),
     "equal": ("spacings: 2 2 2\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n", None),
     "no size": ("", "has no voxel size: assuming 1 mm"),
+    "unknown sizes": ("spacings: nan NaN nan\n", "has no voxel size: assuming 1 mm"),
+    "an unknown size": ("spacings: 2 2 nan\n", "has no voxel size along 1 of 3 axes: assuming 1 mm"),
     "space": (
         LPS.replace("left-posterior-superior", "3D-right-handed"),
         'its space "3D-right-handed" does not tell',

@@ -174,9 +174,12 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
         raise InputError(f'its header has the space "{plain(space)}" but no "space directions"; add them')
     spacings = _numbers(fields.get("spacings", ""))
     mins, maxs = (_numbers(fields.get(key, "")) for key in ("axismins", "axismaxs"))
-    if not len(spacings):
-        notes.append("has no voxel size: assuming 1 mm")
-        spacings = np.ones(len(sizes))
+    n_axes = min(len(sizes), 3)  # a fourth axis, of components or times, may have none
+    n_unknown = n_axes - int(np.isfinite(spacings).sum())
+    if n_unknown > 0:
+        along = "" if n_unknown == n_axes else f" along {n_unknown} of {n_axes} axes"
+        notes.append(f"has no voxel size{along}: assuming 1 mm")
+    spacings = np.where(np.isfinite(spacings), spacings, 1.0) if len(spacings) else np.ones(len(sizes))
     if len(mins) == len(maxs) == len(spacings) == len(sizes):
         steps = [(maxs - mins) / np.maximum(np.array(sizes) - k, 1) for k in (0, 1)]  # of cells, of nodes
         if not any(_is_alike(each, spacings) for each in steps):
