@@ -457,6 +457,13 @@ def test_default_axis_is_the_one_along_z():
     assert mesh.points[high, 2] == pytest.approx(3.0 + 1.5 * 0.5)
 
 
+def test_the_bottom_is_pushed_up_in_a_flipped_image():
+    """By a tenth of five slices of 2 mm, whichever comes first."""
+    for direction in (1.0, -1.0):
+        image = Image(np.zeros((3, 4, 5)), np.diag([1.0, 1.0, 2.0 * direction, 1.0]))
+        np.testing.assert_allclose(elasticity.push_of(image, 10.0), [0.0, 0.0, 1.0], atol=1e-15)
+
+
 def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
     """Sheared: the third axis goes 0.9 to the left for every 0.4 up, and the others not up at all."""
     affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
