@@ -5,6 +5,7 @@ import importlib
 import io
 import re
 import tokenize
+import tomllib
 from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
@@ -269,6 +270,18 @@ def test_only_parts_and_images_know_of_parts_and_stored_voxels():
     ]
     assert forks == []
     assert any(FORK.search(text_of(path)) for path in knowing)
+
+
+def test_mutants_are_of_code_and_tests_that_are_there():
+    """`tests/mutants/run.py` changes a text that a file has once, and runs tests that exist."""
+    stale = []
+    for path in (ROOT / "tests" / "mutants").glob("*.toml"):
+        for mutant in tomllib.loads(text_of(path))["mutant"]:
+            names = [mutant["file"], *(word for word in mutant["tests"].split() if word.endswith(".py"))]
+            is_there = all((ROOT / name).is_file() for name in names)
+            if not is_there or text_of(ROOT / names[0]).count(mutant["old"]) != 1:
+                stale.append((path.name, mutant["file"], mutant["old"]))
+    assert stale == []
 
 
 # Terms that the glossary has replaced, as names and in texts, and what they are called now. Verbs are none of them:
