@@ -45,7 +45,7 @@ from tetopt.io.volumes import (
     one_line,
     volume_index,
 )
-from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
+from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, read_chunks, save_zarr, zarr_levels
 from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
 
@@ -714,8 +714,11 @@ def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds |
         _check_in_crop(bounds, axis, index)
         bounds[axis] = (index, index + 1)
     check_room([stop - start for start, stop in bounds], image.voxels.dtype.itemsize)
-    check_chunks(image.voxels.within(bounds), notes)
-    part = image.box(*zip(*bounds, strict=True))
+    voxels = image.voxels.within(bounds)
+    check_chunks(voxels, notes)
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([start for start, _ in bounds])
+    part = Image(read_chunks(voxels), affine)
     return part if slice_ is None else image_slice(part, slice_[0], 0)
 
 

@@ -11,6 +11,7 @@ import math
 import os
 import stat
 import warnings
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -19,11 +20,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image, checked_affine
+from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import SAME_SIZE, SAME_VOXELS, sizes_words
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
-from tetopt.io.zarr_codecs import PACKERS, bounded
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -46,8 +47,8 @@ WAYS_OF_BODY = {
 ARRAY_AXES = 32  # at most in an array, the limit of the oldest supported numpy
 # Codecs from numbers to as many numbers. Others, such as numcodecs' pickle, would let a file run any code.
 KNOWN_CODECS = (
-    *PACKERS, "bytes", "endian", "transpose", "sharding_indexed", "crc32c", "shuffle", "delta", "bitround",
-    "fixedscaleoffset", "quantize", "astype",
+    "blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma", "bytes", "endian", "transpose", "sharding_indexed", "crc32c",
+    "shuffle", "delta", "bitround", "fixedscaleoffset", "quantize", "astype",
 )  # fmt: skip
 
 
@@ -95,8 +96,29 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
     picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
     for axis, at in zip(level.others, index, strict=True):
         picks[axis] = at
-    voxels = VoxelsInFile(level.folder, bounded(level.array), tuple(picks), level.array.chunks)
+    voxels = VoxelsInFile(level.folder, _guarded(level.array), tuple(picks), level.array.chunks)
     return Image.stored(voxels, level.affine)
+
+
+def read_chunks(voxels: VoxelsInFile) -> NDArray:
+    """Read all of these voxels in a child process, as compiled codecs trust the headers of chunks.
+
+    Raises
+    ------
+    InputError
+        Without a leading path: chunks are damaged, or a codec crashes on them.
+    """
+    picks = [[pick.start, pick.stop] if isinstance(pick, slice) else pick for pick in voxels.picks]
+    n_bytes = math.prod(voxels.shape) * voxels.dtype.itemsize
+    values: NDArray = read_apart(_values, voxels.path, picks, size=n_bytes, value_bytes=n_bytes, library="zarr")
+    return values
+
+
+def _values(folder: str, picks: list[list[int] | int]) -> NDArray:
+    """Return a part of an array, in the child."""
+    parts = tuple(slice(*pick) if isinstance(pick, list) else pick for pick in picks)
+    voxels = VoxelsInFile(Path(folder), _guarded(_node(Path(folder))), parts)
+    return voxels[tuple(slice(0, size) for size in voxels.shape)]
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
@@ -185,6 +207,35 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
             low, high = min(low, float(block.min())), max(high, float(block.max()))
             array[box] = block
     return low, high
+
+
+def _guarded(array: Any) -> Any:
+    """Return the same array, whose chunks have at least the length that Blosc, which reads beyond their end, expects."""
+    if "blosc" not in _codec_names(array.metadata.to_dict()):
+        return array
+    zarr = _library()
+    store = _guarded_store(array.shards is not None)(array.store_path.store.root, read_only=True)
+    return zarr.Array(zarr.AsyncArray(metadata=array.metadata, store_path=zarr.storage.StorePath(store, array.path)))
+
+
+@cache
+def _guarded_store(has_shards: bool) -> Any:
+    """Return the class of a folder of chunks, or of shards, which end in an index of them."""
+    from zarr.abc.store import SuffixByteRequest
+    from zarr.storage import LocalStore
+
+    class GuardedStore(LocalStore):
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            value = await super().get(key, prototype, byte_range)
+            is_index = isinstance(byte_range, SuffixByteRequest) or (has_shards and byte_range is None)
+            if value is None or is_index or key.rpartition("/")[2] in METADATA_FILES:
+                return value
+            length = int.from_bytes(value.to_bytes()[12:16], "little")
+            if len(value) < length:  # a checksum may follow
+                raise ValueError(f"a chunk has {len(value)} bytes, its Blosc header {length}")
+            return value
+
+    return GuardedStore
 
 
 def _stored_values(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
@@ -306,9 +357,6 @@ def _check_array(array: Any) -> None:
     unknown = sorted({name for name in names if name not in KNOWN_CODECS})
     if unknown:
         raise InputError(f"unsupported codecs in its chunks: {plain(', '.join(unknown))}; write it again with others")
-    packers = [name for name in names if name in PACKERS]
-    if len(packers) > 1:
-        raise InputError(f"its chunks are compressed several times, by {', '.join(packers)}; use only one of these")
     shape = " x ".join(str(size) for size in array.chunks)
     n_bytes = math.prod(array.chunks) * dtype.itemsize
     check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again with smaller chunks")

@@ -1,29 +1,23 @@
-"""Chunks of Zarr that lie: of their own length, of what they unpack to, of how many there are."""
+"""Zarr of all codecs, and chunks that lie: of their own length, of what they unpack to, of how many there are."""
 
-import bz2
 import json
-import lzma
 import struct
-import tracemalloc
 import zlib
 
 import numcodecs
 import numpy as np
 import pytest
 import zarr
-from numcodecs import AsType, Blosc, Delta, GZip, Shuffle, Zlib, Zstd
+from numcodecs import AsType, Blosc, Delta, GZip, Shuffle, Zlib
 from zarr.codecs import BloscCodec, Crc32cCodec, GzipCodec, ZstdCodec
 
 from tetopt.errors import InputError
 from tetopt.io.images import load_image
 from tetopt.io.stored_images import open_stored
-from tetopt.io.zarr_codecs import PACKERS, unpacked
 
 VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
-CHUNK = VALUES[:4, :4, :4].tobytes()  # 128 bytes
-BOMB = bytes(2**25)
-# Of unknown length: Zstandard's frame without a size, of blocks that repeat one byte 128 times.
-FRAME, BLOCK, LAST_BLOCK = b"\x28\xb5\x2f\xfd\0\0", b"\x02\x04\0\x07", b"\x03\x04\0\x07"
+PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
+LINE = "its voxels .* cannot be read|zarr crashed|more than 2.1 GB of memory"
 pytestmark = pytest.mark.filterwarnings("ignore")  # of sizes of boxes, and codecs that Zarr 3 has not specified
 
 
@@ -76,13 +70,16 @@ def refused(path, words):
     [(3, 0), (4, 2**31 - 1), (4, 2000), (4, 127), (4, 0), (8, 0), (8, 2**31), (12, 2**31 - 1), (12, 100_000), (12, 0)],
 )
 def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
-    """Blosc would read beyond the chunk's end: a crash, or memory of the process for voxels."""
+    """Blosc may read beyond the chunk's end, which only the child survives: a line, or the right voxels."""
     fmt, options = KINDS[kind]
     chunk = written(tmp_path / "a.zarr", fmt, **options)
     content = bytearray(chunk.read_bytes())
     struct.pack_into("<B" if offset == 3 else "<I", content, offset, number)
     chunk.write_bytes(content)
-    refused(tmp_path / "a.zarr", "its voxels .* cannot be read .*chunk")
+    try:
+        np.testing.assert_array_equal(load_image(tmp_path / "a.zarr").data, VALUES)
+    except InputError:
+        refused(tmp_path / "a.zarr", LINE)
 
 
 @pytest.mark.deep
@@ -92,38 +89,15 @@ def test_chunks_that_are_cut(tmp_path, name):
     content = chunk.read_bytes()
     for length in (0, 1, 4, 5, 6, 15, 16, len(content) - 1):
         chunk.write_bytes(content[:length])
-        refused(tmp_path / "a.zarr", "cannot be read")
+        refused(tmp_path / "a.zarr", LINE)
 
 
-BOMBS = {
-    **{name: bytes(packer(name).encode(BOMB)) for name in ("blosc", "zstd", "lz4")},
-    "gzip": zlib.compress(BOMB, wbits=31),
-    "zlib": zlib.compress(BOMB),
-    "bz2": bz2.compress(BOMB),
-    "lzma": lzma.compress(BOMB, preset=1),
-}
-
-
-@pytest.mark.deep
-@pytest.mark.parametrize("name", PACKERS)
-def test_a_bomb_takes_no_memory(name):
-    """32 MB for 128 bytes; the least of three, as threads that other tests left may take some meanwhile."""
-    for packed in (BOMBS[name], BOMBS[name] * 2):
-        peaks = []
-        for _ in range(3):
-            tracemalloc.start()
-            with pytest.raises(ValueError, match=r"^a chunk "):
-                unpacked(name, packed, 128)
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
-        assert min(peaks) < 2**24
-
-
-def test_zstandard_without_its_length():
-    assert unpacked("zstd", FRAME + LAST_BLOCK, 128) == b"\x07" * 128
-    for packed in (FRAME + BLOCK * 1000 + LAST_BLOCK, bytes(Zstd().encode(CHUNK)) + bytes(Zstd().encode(BOMB))):
-        with pytest.raises((ValueError, RuntimeError)):
-            unpacked("zstd", packed, 128)
+@pytest.mark.parametrize("fmt", [2, 3])
+def test_a_bomb_is_refused_in_one_line(tmp_path, fmt):
+    """A chunk of 32 MB for 128 bytes."""
+    chunk = written(tmp_path / "a.zarr", fmt, compressors=GZip() if fmt == 2 else GzipCodec())
+    chunk.write_bytes(zlib.compress(bytes(2**25), wbits=31))
+    refused(tmp_path / "a.zarr", LINE)
 
 
 def changed(path, fmt, **values):
@@ -159,8 +133,3 @@ def test_a_chunk_of_any_length(tmp_path):
     with chunk.open("r+b") as file:
         file.truncate(2**40)  # a hole, which takes no room
     refused(tmp_path / "a.zarr", "its chunk 0.0.0 has 1099511627776 bytes")
-
-
-def test_chunks_that_are_packed_twice_are_refused(tmp_path):
-    written(tmp_path / "a.zarr", 2, compressors=GZip(), filters=[Zlib()])
-    refused(tmp_path / "a.zarr", "compressed several times, by gzip, zlib")
