@@ -210,7 +210,7 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
 
 
 def _guarded(array: Any) -> Any:
-    """Return the same array, whose chunks have at least the length that Blosc, which reads beyond their end, expects."""
+    """Return the same array, of chunks with at least the length that Blosc, which reads beyond their end, expects."""
     if "blosc" not in _codec_names(array.metadata.to_dict()):
         return array
     zarr = _library()
