@@ -138,7 +138,6 @@ bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/benchmark_kernels.py -o bench_kernels.json --force
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/fit_cost.py --rows cost_runs.jsonl -o cost.toml --force
 
 # Every number of docs/measured and of README's table, and these pages: 1.5 hours. DATA is a folder with the images that
 # scripts/measure.py names; PEERS are its options for CGAL, whose programs docs/howto/own_mesher.md describes.
@@ -171,4 +170,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo measured docs/_build docs/gallery bench.json bench_kernels.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
+	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo measured docs/_build docs/gallery bench.json bench_kernels.json bench_blocks.json fingerprints.json

@@ -95,9 +95,7 @@ def run_summary(run: dict[str, Any]) -> dict[str, Any]:
         "slivers": quality["kinds"]["sliver"],
         "initial": {key: run["quality_initial"][key] for key in ("mean_rho", "p1_rho", "min_dihedral")},
         "seconds": run["seconds"]["all"],
-        "predicted_seconds": run["prediction"].get("seconds"),
         "peak_gb": run["memory"]["peak_bytes"] / 1e9,
-        "predicted_gb": run["prediction"].get("peak_bytes", 0.0) / 1e9,  # neither is known of a run in parts
         "mask": run.get("mask"),
         "labels": labels,
         "contacts": contacts,

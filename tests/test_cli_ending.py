@@ -313,7 +313,7 @@ ERRORS = [MemoryError(), IndexError("index 7 is out of bounds"), tetopt.InputErr
 MEASURES = {  # where each is called, and its keys in run.json
     "quality": (tetopt.job.run, {"quality_initial", "quality"}),
     "edge_ratios": (tetopt.job.write, {"edges_over_target"}),
-    "nodes_of_sizes": (tetopt.job.write, {"nodes_of_sizes"}),
+    "nodes_of_targets": (tetopt.job.write, {"nodes_of_sizes"}),
     "crowded_nodes": (tetopt.job.write, {"nodes_of_many_labels"}),
     "mask_fidelity": (tetopt.report.summary, {"mask"}),
     "label_fidelity": (tetopt.report.summary, {"labels"}),

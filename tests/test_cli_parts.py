@@ -35,7 +35,6 @@ REFUSED = [
     ("--parts 2 --order 2", "--order: needs all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
     ("--parts 4", "--parts: expected at most 3 for 300 nodes .100 each., got 4$"),
-    ("--parts 4 --predict", "--parts: expected at most 3 for 300 nodes"),
     ("--parts 2 --worker-gb 0", "--worker-gb: expected more than 0"),
     ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: only for workers on this machine"),
     ("--parts 2 --workers 2 --scheduler tcp://127.0.0.1:9", "--workers: expected none with --scheduler"),
@@ -80,8 +79,8 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, mo
     for name, value in one["image_properties"].items():
         assert np.allclose(value, other["image_properties"][name], rtol=1e-12), name
     assert one["options"]["parts"] == 2
-    assert one["prediction"]["task_bytes"] > 1e5
-    assert one["memory"].keys() == {"peak_bytes"}
+    assert one["memory"].keys() == {"peak_bytes", "task_bytes"}
+    assert one["memory"]["task_bytes"] > 1e5
     loaded = load_mesh(tmp_path / "b.vtu")
     direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii"))
     assert np.array_equal(loaded.cell_data["n_voxels"], direct["n_voxels"])
@@ -181,20 +180,9 @@ def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inpu
 
 
 def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):
-    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict"]
+    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--iterations", 0]
     assert exit_code(*command, "--worker-gb", 2) == 0
-    captured = capfd.readouterr()
-    assert "--worker-gb is ignored: the mesh is built in one piece" in captured.err
-    assert "at peak" in captured.out
-
-
-def test_predicted_parts(tmp_path, inputs, capfd):
-    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict", "--parts", 2]
-    assert exit_code(*command, "--worker-gb", 0.1) == 0
-    captured = capfd.readouterr()
-    assert captured.out.startswith("about 2 parts per round, each up to ")
-    assert "--worker-gb 0.1: less than a worker needs" in captured.err
-    assert list(tmp_path.iterdir()) == []
+    assert "--worker-gb is ignored: the mesh is built in one piece" in capfd.readouterr().err
 
 
 def test_places_on_the_network_are_refused(tmp_path, capfd):

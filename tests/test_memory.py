@@ -21,13 +21,13 @@ from tetopt.cli import warm_up
 from tetopt.contents.content import content, plain
 from tetopt.contents.memberships import memberships
 from tetopt.energy.sampling import sampling_grid
-from tetopt.engine import cost
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.meshing import bytes_of
+from tetopt.engine.memory import BOUND_MARGIN, CHANNEL_BYTES, MESHED_CELL_BYTES, meshing_bytes, next_bytes
+from tetopt.engine.meshing import bytes_of, process_bytes
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
 from tetopt.job.events import listened, started
-from tetopt.job.meshing import prepare, watched
+from tetopt.job.meshing import left_words, prepare, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of
 from tetopt.system import budget
@@ -129,9 +129,19 @@ def test_what_is_kept_of_voxels_counts():
     ones = tetopt.Image(np.ones((6, 5, 4)))
     kinds = [plain(IMAGE), content(IMAGE, mask=tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine))]
     first, masked = (bytes_of(kind, 0) for kind in kinds)
-    of_one = {name: cost.BOUND_MARGIN * n_bytes for name, n_bytes in cost.cost_model().bytes.items()}
-    assert masked - first == pytest.approx(of_one["channel_voxels"] * IMAGE.data.size)
-    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == pytest.approx(300 * of_one["cells"])
+    assert masked - first == pytest.approx(BOUND_MARGIN * CHANNEL_BYTES * IMAGE.data.size)
+    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == pytest.approx(300 * BOUND_MARGIN * MESHED_CELL_BYTES)
+    assert next_bytes(0) == 0.0
+    assert 0.0 < next_bytes(1000) < meshing_bytes(0, 0, 1000)
+
+
+def test_a_whole_process_holds_what_it_reads():
+    """Besides meshing: the image's voxels, and those of a mask and of labels' levels."""
+    mask, labels = tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine), tetopt.Image(np.rint(IMAGE.data), IMAGE.affine)
+    bare, masked, labelled = (content(IMAGE), content(IMAGE, mask=mask), content(IMAGE, labels))
+    beside = [(process_bytes(each, 50) - bytes_of(each, 50)) for each in (bare, masked, labelled)]
+    assert beside[0] < beside[1] < beside[2]
+    assert process_bytes(bare, 0) > 1.5e8
 
 
 @pytest.mark.full
@@ -233,6 +243,40 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
     assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])
     assert re.fullmatch(rf"  in iteration 1, 11\.0 s, ({memory})", lines[1])
     assert lines[2].startswith("iteration   1/1  E 0.9000")
+
+
+def records(*seconds):
+    """Records of iterations that ended at these times."""
+    return [IterationRecord(n, 1.0, 1.0, 1.0, 0.1, False, 48, 504, at) for n, at in enumerate(seconds)]
+
+
+def test_the_time_left_is_told_from_the_third_iteration_on():
+    """At the pace of the last two iterations, within the time that is allowed; after the last there is none."""
+    assert left_words(records(1.0, 9.0, 15.0), 10, None) == ""
+    history = records(1.0, 9.0, 15.0, 19.0)
+    assert left_words(history, 10, None) == ", about 35 s left"
+    assert left_words(history, 10, 25.0) == ", about 6 s left"
+    assert left_words(history, 10, 18.0) == ", about 0 s left"
+    assert left_words(history, 103, None) == ", about 8 min left"
+    assert left_words(history, 3, None) == ""
+
+
+def test_the_log_tells_nodes_memory_and_time(tmp_path, capsys):
+    """The nodes of sizes and the bound of memory, as in run.json, come before the first iteration."""
+    tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
+    words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--edge-size", "9", "--iterations", "5")
+    assert exit_code(*words) == 0
+    said = capsys.readouterr().err.replace("\n", " ")
+    before, _, after = said.partition("iteration   0/5")
+    numbers = numbers_in(tmp_path / "a.json")
+    assert f"sizes require about {numbers['nodes_of_sizes']} nodes" in before
+    bound = numbers["memory"]["predicted_bytes"]
+    stated = float(re.search(r"at most (\S+) GB of memory", before)[1])
+    assert stated == pytest.approx(bound / 1e9, rel=0.05)
+    assert numbers["memory"]["peak_bytes"] < 1.2 * bound
+    lines = re.split(r"iteration +\d+/5", after)
+    is_told = ["s left" in line for line in lines]
+    assert is_told == [False, False, False, True, True, False][: len(lines)]
 
 
 def test_warm_up_tells_how_compiling_goes(monkeypatch, capsys):

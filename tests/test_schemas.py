@@ -93,7 +93,7 @@ def test_the_tables_have_every_key(numbers):
     lines = "\n".join(tables(schema("run"), "run"))
     for key in numbers[0]:
         assert f"| `{key}`" in lines
-    for key in ("errors.worst", "kinds.sliver", "[].E_G", "size.n_read", "KEY.colour"):
+    for key in ("errors.worst", "kinds.sliver", "[].E_G", "KEY.colour"):
         assert f"| `{key}`" in lines
     assert "| `E_D_fraction_of_variance` |" in lines
     assert "| `label_weight` | " in lines

@@ -11,7 +11,6 @@ import pytest
 import trimesh
 
 import tetopt
-from tetopt.engine.cost import RunSize, cost_model, memory_terms, once_terms, swept_terms
 from tetopt.geometry.topology import components
 
 pytestmark = pytest.mark.deep
@@ -149,65 +148,6 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
     assert "exists" in capsys.readouterr().err
     assert script("choose_average").main([*words, "--force", "--averages", "voigt"]) == 2
     assert "average: expected mean" in capsys.readouterr().err
-
-
-def measured_rows(module):
-    """Runs that cost what a known model says, a fifth of them left out of the fit; half of them on a slow machine."""
-    rng = np.random.default_rng(0)
-    size = RunSize(1, 1, 1, 1)
-    seconds = {name: 10.0 ** rng.uniform(-7, -5) for name in (*once_terms(size), *swept_terms(size))}
-    n_bytes = {name: 10.0 ** rng.uniform(0, 2) for name in memory_terms(size)}
-    seconds |= {"process": 2.0, "pictures": 1.0}
-    n_bytes |= {"process": 3e8, "pictures": 5e7}
-    rows = []
-    for number in range(60):
-        numbers = 10.0 ** rng.uniform([5, 5, 3], [7, 7, 5])
-        size = RunSize(*map(int, numbers), iterations=int(rng.integers(0, 20)), n_channels=int(rng.integers(1, 6)))
-        mode = ("graded", "uniform", "paper")[number % 3]
-        size = size._replace(mode=mode, has_region=number % 2 == 0, has_memberships=number % 5 < 2)
-        size = size._replace(is_drawn=number % 7 < 3, is_fractional=number % 11 < 5)
-        once, swept = (module.summed(seconds, terms(size)) for terms in (once_terms, swept_terms))
-        pace = 1.0 + (number % 4 == 0)
-        row = module.Row(
-            f"{number}", number % 5 == 4, 1, 0.02 * pace, pace * (once + swept), 0.0, 0.0,
-            int(module.summed(n_bytes, memory_terms(size))), size,
-        )  # fmt: skip
-        rows += [row, row._replace(threads=2, main_seconds=pace * (once + 0.6 * swept))]
-    return rows, seconds, n_bytes
-
-
-def test_costs_are_fitted(tmp_path, capsys):
-    """Costs that rows were made of come back from the file that the script writes, as does the threads' fraction."""
-    module = script("fit_cost")
-    rows, seconds, n_bytes = measured_rows(module)
-    model = module.fitted(rows)
-    (tmp_path / "cost.toml").write_text(module.model_text(model, rows))
-    back = cost_model(tmp_path / "cost.toml")
-    for name, value in seconds.items():
-        assert back.seconds[name] == pytest.approx(value, rel=0.05, abs=1e-9)
-    for name, value in n_bytes.items():
-        assert back.bytes[name] == pytest.approx(value, rel=0.05)
-    assert back.parallel_fraction == pytest.approx(0.8, rel=0.01)
-    assert back.calibration_seconds == pytest.approx(0.02)
-    assert back.seconds_factor == pytest.approx(1.0, abs=0.01)
-    assert back.bytes_fraction == pytest.approx(0.0, abs=0.01)
-    assert module.table(model, rows).count("| 1.00 |") > 50
-
-
-@pytest.mark.slow
-def test_runs_are_measured_once(tmp_path, capsys):
-    """Quick runs, whole processes; the second time only the model is written again."""
-    main = script("fit_cost").main
-    words = ["-o", str(tmp_path / "cost.toml"), "--rows", str(tmp_path / "rows.jsonl"), "--quick"]
-    assert main(words) == 0
-    rows = (tmp_path / "rows.jsonl").read_text()
-    assert len(rows.splitlines()) == 2
-    assert main(words) == 2
-    assert "--force" in capsys.readouterr().err
-    assert main([*words, "--force"]) == 0
-    assert (tmp_path / "rows.jsonl").read_text() == rows
-    assert "| less |" in capsys.readouterr().out
-    assert cost_model(tmp_path / "cost.toml").seconds["process"] > 0.0
 
 
 def test_benchmark_of_parts(tmp_path, capsys):

@@ -23,9 +23,7 @@ def main(n_subjects: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         words = ("--nodes=100000", "--iterations=20", "--", f"{folder}/a-usual-name-of-an-image_T1w.nii.gz")
-        jobs = [
-            SubjectTask(f"sub-{k:06d}", words, str(folder), ".vtu", 1, 1.0, 1.0, "run-1") for k in range(n_subjects)
-        ]
+        jobs = [SubjectTask(f"sub-{k:06d}", words, str(folder), ".vtu", 1, 1.0, "run-1") for k in range(n_subjects)]
         with workers(Need(n_subjects, 1.0, 1), Folders(folder, folder), count=2, scheduler=None, cluster=None) as crew:
             list(run_all(jobs[:100], crew.client, crew.slots, crew.bytes, task=nothing))  # what is imported once
             for part in range(1, 5):

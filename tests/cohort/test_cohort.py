@@ -26,7 +26,6 @@ from tetopt.cohort.layout import begin, locked
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
-from tetopt.engine.cost import Prediction
 from tetopt.job.options import RunOptions
 
 WAIT_SECONDS = 240  # a machine with much else to do still gets there
@@ -290,15 +289,15 @@ def test_the_table_of_what_would_be_run(small, capsys):
 def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--dry-run") == 0
     words = capsys.readouterr().out
-    assert re.search(r"sub-01: \d+ s on one thread, \d+ MB|sub-01: \d+ s on one thread, 0\.\d+ GB", words)
-    assert "in total" in words
+    assert re.search(r"sub-01: 0\.\d+ GB\n", words)
+    assert re.search(r"2 subjects, at most 0\.\d+ GB each; \d at a time", words)
     assert not (small / "out").exists()
 
 
 def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
     """It does not begin here; jobs of a batch system may still have that memory."""
     monkeypatch.setattr(estimate_module, "available_bytes", lambda: 8e9)
-    estimate = {"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)}
+    estimate = {"a": 1e9, "b": 1e11}
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
     assert [estimate_module.need_of(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
 

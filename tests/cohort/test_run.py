@@ -31,7 +31,7 @@ def image(tmp_path_factory):
 def job_in(out, image):
     begin(out)
     (out / ".work" / "run-1").touch()
-    return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, 0.0, "run-1")
+    return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, "run-1")
 
 
 @pytest.fixture

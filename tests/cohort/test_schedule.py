@@ -71,8 +71,7 @@ def play(tmp_path, monkeypatch):
         monkeypatch.setattr(distributed, "wait", client.wait)
         sizes = n_bytes or {}
         jobs = [
-            SubjectTask(f"sub-{x}", (), str(tmp_path / "out"), ".vtu", 1, sizes.get(x, 1.0), 1.0, "run-1")
-            for x in letters
+            SubjectTask(f"sub-{x}", (), str(tmp_path / "out"), ".vtu", 1, sizes.get(x, 1.0), "run-1") for x in letters
         ]
         return list(run_all(jobs, client, slots, room))
 
@@ -129,7 +128,7 @@ def test_a_subject_that_does_not_fit_does_not_begin(play, tmp_path):
     assert {each.key: each.status for each in ended} == {"sub-a": "done", "sub-b": "failed", "sub-c": "done"}
     record = failure(tmp_path, "sub-b")
     assert record["attempts"] == 0
-    assert "needs 1 GB of memory (predicted)" in record["reason"]
+    assert "needs 1 GB of memory, but a worker has 1 GB" in record["reason"]
 
 
 def test_where_there_is_no_worker_it_waits_and_where_there_are_more_it_uses_them(play, monkeypatch):
@@ -182,7 +181,7 @@ def slow(job):
 
 def test_what_dask_itself_cancels_is_run_again(tmp_path):
     """Dask says so by an error of the wait, not only of the future."""
-    jobs = [SubjectTask(f"sub-{x}", (), str(tmp_path), ".vtu", 1, 1.0, 1.0, "run-1") for x in "ab"]
+    jobs = [SubjectTask(f"sub-{x}", (), str(tmp_path), ".vtu", 1, 1.0, "run-1") for x in "ab"]
     cancelled = []
 
     def cancel(client):

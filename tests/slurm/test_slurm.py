@@ -183,7 +183,7 @@ def test_jobs_that_end_are_replaced(slurm, tmp_path):
 
     out = tmp_path / "out"
     begin(out)
-    jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, 1.0, "run-1") for k in range(1, 5)]
+    jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, "run-1") for k in range(1, 5)]
     before = set(jobs_of_slurm())
     folders = Folders(out / ".work", out / "logs")
     with workers(Need(4, 1.0, None), folders, count=1, scheduler=None, cluster=file_of(tmp_path)) as crew:

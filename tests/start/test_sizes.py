@@ -10,10 +10,9 @@ from scipy.sparse.csgraph import dijkstra
 from test_octree import OBLIQUE, ball, grid
 
 import tetopt
-from tetopt.contents.content import plain
 from tetopt.engine.meshing import meshed_to_error
 from tetopt.start import octree
-from tetopt.start.octree import _Blocks, _divided, least_nodes, nearest_octree, nodes_of_sizes, octree_mesh
+from tetopt.start.octree import _Blocks, _divided, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
 
 
@@ -293,10 +292,11 @@ def test_the_coarsest_octree_is_counted_without_blocks(monkeypatch, sizes):
     content = tetopt.content(image, mask=tetopt.Image(1.0 * (image.data > 50), image.affine))
     count, within = (len(nearest_octree(each, 60, sizes).points) for each in (image, content))
     monkeypatch.setattr(octree, "_blocks_by_depth", None)
-    assert least_nodes(plain(image), 60, sizes) == count > 100
-    assert 0.5 * within < least_nodes(content, 60, sizes) < 1.1 * within
+    assert count > 100
     with pytest.raises(tetopt.InputError, match=f"which need at least .*; use {count}, or allow longer edges"):
         octree_mesh(image, 60, sizes)
+    enough = octree._coarsest_nodes(content, 60, octree._block_limits(content, 60, sizes))
+    assert 0.5 * within < enough < 1.1 * within
 
 
 def test_the_longest_edge_of_any_number_of_nodes():

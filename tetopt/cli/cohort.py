@@ -16,14 +16,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from tetopt.cli.console import log, print_line, show_error, show_event
 from tetopt.cluster.crew import counted
 from tetopt.cluster.workers import local_share
-from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned, time_words
+from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned
 from tetopt.cohort.estimate import need_of
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
-from tetopt.job.events import Event, listened
+from tetopt.job.events import Event, listened, time_words
 from tetopt.job.options import Option, RunOptions
 from tetopt.system.budget import memory_words
 
@@ -57,21 +57,21 @@ def cohort_command(
 
 
 def _say_estimate(plan: CohortPlan) -> None:
-    """Print which subjects would be run, with their time and memory."""
+    """Print which subjects would be run, with their memory."""
     to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
     for entry in to_run:
         if (one := estimate.get(entry.key)) is None:
             print_line(f"{entry.key}: size unknown because its image cannot be read")
         else:
-            print_line(f"{entry.key}: {one.seconds:.0f} s on one thread, {memory_words(one.peak_bytes)}")
-    seconds = sum(one.seconds for one in estimate.values())
-    peak = max((one.peak_bytes for one in estimate.values()), default=0.0)
-    whole = f"in total {time_words(seconds)} on one thread, at most {memory_words(peak)} each"
-    if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
-        print_line(f"{whole}; divide by the number of simultaneous subjects" if to_run else "nothing to run")
+            print_line(f"{entry.key}: {memory_words(one)}")
+    if not to_run:
+        print_line("nothing to run")
         return
-    n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
-    print_line(f"{whole}; about {time_words(seconds / n_workers)} on this machine, {n_workers} at a time")
+    whole = f"{counted(len(to_run), 'subject')}, at most {memory_words(max(estimate.values(), default=0.0))} each"
+    if cohort.cluster is None and cohort.scheduler is None:
+        n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
+        whole += f"; {n_workers} at a time on this machine"
+    print_line(whole)
 
 
 class _CohortDisplay:

@@ -8,28 +8,22 @@ from typing import Annotated
 
 from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
 from tetopt.cli.ending import is_ended, mesh_kept, tell_end
-from tetopt.cli.options import ForceOption, PredictOption
-from tetopt.cli.predict import print_parts, print_prediction
+from tetopt.cli.options import ForceOption
 from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
 from tetopt.io.mni import mni_path
-from tetopt.job.events import listened
 from tetopt.job.job import Job
 from tetopt.job.options import DEFAULT_NODES, Option, has_model
-from tetopt.job.read import read
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
-from tetopt.start.octree import check_octree
 from tetopt.system.files import results_folder
 
 
-def mesh_command(job: Job, predict: PredictOption = False) -> int:
+def mesh_command(job: Job) -> int:
     """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or for a solver."""
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
-        if predict:
-            return _predict(job, display)
         result = run(job, display, display.is_over)
         display.end_stage()
         _print(result)
@@ -38,17 +32,6 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
         code = tell_end() if is_ended() else int(bool(result.violated))
         print_verdict(result.violated, f"{job.output}: {size}")
         return code
-
-
-def _predict(job: Job, display: Display) -> int:
-    """Print the time and memory that the run will take."""
-    with listened(display):
-        task = read(job)
-        display.end_stage()
-    if task.plan.mode == "graded" and task.plan.job.nodes is not None and task.plan.order == 1:
-        check_octree(task.source.content, task.plan.job.nodes, task.sizes)
-    task.plan.division.chosen(print_prediction, print_parts)(task)
-    return 0
 
 
 def _print(result: Result) -> None:

@@ -44,7 +44,6 @@ FilesArgument = Annotated[
         is_argument=True,
     ),
 ]
-PredictOption = Annotated[bool, Option(None, "Predict the run's time and memory, and write nothing.")]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
@@ -18,6 +18,7 @@ from tetopt.cluster.crew import counted
 from tetopt.engine.loop import IterationRecord
 from tetopt.job.events import Event, Stage
 from tetopt.job.in_parts import PartsProgress
+from tetopt.job.meshing import left_words
 from tetopt.system.budget import memory_words, resident_bytes
 
 LINE_SECONDS = 10.0  # between lines, if there is no terminal for a bar
@@ -77,7 +78,7 @@ class Display:
         elif stage.name == "optimise":
             self._begin_keeping()
             self._begin, self._n_rows, self._say = time.perf_counter(), 0, rare_lines()
-            show = self._shown.enter_context(_bar(stage.number or 0))
+            show = self._shown.enter_context(_bar(stage.number or 0, stage.most_seconds))
 
             def recorded(event: Event) -> None:
                 self._n_rows += 1
@@ -147,27 +148,33 @@ def _spent(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _bar(iterations: int) -> Iterator[Callable[[IterationRecord], None]]:
-    """Yield a function that shows each record: a bar with the remaining time on a terminal, else a line."""
-    first: list[IterationRecord] = []
+def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[IterationRecord], None]]:
+    """Yield a function that shows each record, with the time left: a bar on a terminal, else a line."""
+    history: list[IterationRecord] = []
 
     def words(row: IterationRecord) -> str:
-        first.append(row)
-        E_D = f"  E_D {row.E_D / first[0].E_D:.4f}" if first[0].E_D > 0.0 else ""
-        return f"E {row.E:.4f}  E_G {row.E_G / first[0].E_G:.4f}{E_D}"
+        history.append(row)
+        first = history[0]
+        E_D = f"  E_D {row.E_D / first.E_D:.4f}" if first.E_D > 0.0 else ""
+        return f"E {row.E:.4f}  E_G {row.E_G / first.E_G:.4f}{E_D}"
+
+    def left() -> str:
+        return left_words(history, iterations, most_seconds)
 
     if log.is_terminal:
         columns = (
-            TextColumn("optimising"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            TextColumn("{task.fields[energies]}"),
+            TextColumn("optimising"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[energies]}"),
         )  # fmt: skip
         with Progress(*columns, console=log, transient=True) as bar:
             task = bar.add_task("", total=iterations, energies="")
-            yield lambda row: bar.update(task, completed=row.iteration, energies=words(row))
+            yield lambda row: bar.update(task, completed=row.iteration, energies=words(row) + left())
     else:
-        yield lambda row: log.print(
-            f"iteration {row.iteration:3d}/{iterations}  {words(row)}  {row.n_cells} cells  {_spent(row.seconds)}"
-        )
+
+        def tell(row: IterationRecord) -> None:
+            begin = f"iteration {row.iteration:3d}/{iterations}  {words(row)}"
+            log.print(f"{begin}  {row.n_cells} cells  {_spent(row.seconds)}{left()}")
+
+        yield tell
 
 
 @contextlib.contextmanager

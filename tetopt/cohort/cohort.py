@@ -38,7 +38,6 @@ from tetopt.cohort.plan import (
 from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
-from tetopt.engine.cost import Prediction
 from tetopt.errors import InputError
 from tetopt.job.events import Listener, listened, note, progress, started, violated, warning
 from tetopt.job.job import in_kinds
@@ -237,7 +236,7 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
         ) as pool:
             note(pool.words)
             jobs = [_job(entry, estimate, place, plan.suffix, pool.threads, alive.name) for entry in to_run]
-            jobs.sort(key=lambda job: -job.seconds)  # so that no long run remains alone at the end
+            jobs.sort(key=lambda job: -job.n_bytes)  # so that no large run remains alone at the end
             refresh, tell = _refresher(place), _teller(jobs, pool.slots())
             try:
                 for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
@@ -265,33 +264,22 @@ def _refresher(place: Path) -> Callable[[], None]:
 
 
 def _job(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
-    one = estimate.get(entry.key, Prediction(0.0, 0.0, 0.0))
-    return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
+    return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, estimate.get(entry.key, 0.0), run)
 
 
 def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], None]:
-    """Return a function that reports a subject's outcome and the remaining time; report the total time first."""
-    begun = time.monotonic()
-    left = {job.key: max(job.seconds, 1.0) for job in jobs}
-    total, n_failed = sum(left.values()), 0
-    started("subjects", f"about {time_words(total / max(n_at_once, 1))} left (predicted)", len(jobs))
+    """Return a function that reports a subject's outcome, and the remaining time at the pace of those that ended."""
+    begun, n_done, n_failed = time.monotonic(), 0, 0
+    started("subjects", f"{counted(len(jobs), 'subject')}, {max(n_at_once, 1)} at a time", len(jobs))
 
     def tell(ended: Ended) -> None:
-        nonlocal n_failed
+        nonlocal n_done, n_failed
+        n_done += 1
         n_failed += ended.status == "failed"
-        left.pop(ended.key, None)
-        rest = sum(left.values())
-        seconds_left = (time.monotonic() - begun) * rest / max(total - rest, 1.0) if left else None
+        seconds_left = (time.monotonic() - begun) * (len(jobs) / n_done - 1.0) if n_done < len(jobs) else None
         what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
         memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
-        at = CohortProgress(ended, len(jobs) - len(left), len(jobs), n_failed, seconds_left)
+        at = CohortProgress(ended, n_done, len(jobs), n_failed, seconds_left)
         progress(f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})", at)
 
     return tell
-
-
-def time_words(seconds: float) -> str:
-    """Format a time."""
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"

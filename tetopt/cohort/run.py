@@ -43,8 +43,7 @@ class SubjectTask(NamedTuple):
     out: str  # the cohort's folder
     suffix: str  # of the mesh's file
     threads: int
-    n_bytes: float  # predicted memory
-    seconds: float  # predicted, on one thread
+    n_bytes: float  # of memory, estimated; 0 if unknown
     run: str  # name of a file in the work directory: once it is removed, the run is abandoned
 
 

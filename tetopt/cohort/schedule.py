@@ -29,7 +29,7 @@ def run_all(
     slots : callable
         Returns the number of simultaneous tasks; called repeatedly.
     room : float
-        Bytes of memory for one task; a subject with a larger prediction does not begin.
+        Bytes of memory for one task; a subject that needs more does not begin.
     task : callable
         Function to run for each; it can be pickled.
 
@@ -41,7 +41,7 @@ def run_all(
     fitting = [job for job in jobs if job.n_bytes <= room]
     for job in jobs:
         if job.n_bytes > room:
-            reason = f"needs {memory_words(job.n_bytes)} of memory (predicted), but a worker has {memory_words(room)}"
+            reason = f"needs {memory_words(job.n_bytes)} of memory, but a worker has {memory_words(room)}"
             yield _failed(job, f"{reason}; reduce the number of nodes, or use larger workers", 0)
     tasks = [(f"{job.key}-{job.run}", job) for job in fitting]
     for outcome in outcomes(client, slots, task, tasks, MOST_ATTEMPTS, repeats=Exception):

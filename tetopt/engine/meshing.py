@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
-from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.curving import curved
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
@@ -34,6 +33,7 @@ from tetopt.engine.loop import (
     Boundary,
     MeshingResult,
 )
+from tetopt.engine.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, meshing_bytes
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.requirements import requested, unexplained_by
 from tetopt.errors import InputError
@@ -263,9 +263,17 @@ def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int, Counter[int]]:
 
 
 def bytes_of(content: Content, nodes: int) -> float:
-    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.engine.cost.meshing_bytes`."""
+    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.engine.memory.meshing_bytes`."""
     image = content.image
     return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
+
+
+def process_bytes(content: Content, nodes: int) -> float:
+    """Memory of a whole process that reads the files of a content and meshes it with `nodes` nodes."""
+    of_voxel = READ_BYTES
+    of_voxel += 0.0 if content.region is None else REGION_BYTES
+    of_voxel += 0.0 if content.memberships is None else LABEL_BYTES
+    return PROCESS_BYTES + of_voxel * prod(content.image.shape) + bytes_of(content, nodes)
 
 
 def check_target_error(target_error: float) -> None:

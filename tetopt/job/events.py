@@ -22,6 +22,7 @@ class Stage(NamedTuple):
 
     name: str  # read, start, kernels, optimise, parts, write, ...
     number: int | None  # of iterations
+    most_seconds: float | None = None  # after which the stage ends, if limited
 
 
 class Event(NamedTuple):
@@ -77,9 +78,16 @@ def ended_words(ended: str, kept: str) -> str:
     return f"{ENDED_WORDS[ended]}: {kept} is kept"
 
 
-def started(stage: str, text: str = "", number: int | None = None) -> None:
-    """Report that a stage begins, which ends the previous one, and its number of iterations."""
-    _LISTENER.get()(Event("started", text, Stage(stage, number)))
+def time_words(seconds: float) -> str:
+    """Format a time."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def started(stage: str, text: str = "", number: int | None = None, most_seconds: float | None = None) -> None:
+    """Report that a stage begins, which ends the previous one, its number of iterations and its longest time."""
+    _LISTENER.get()(Event("started", text, Stage(stage, number, most_seconds)))
 
 
 def progress(text: str, data: Any = None) -> None:

@@ -20,9 +20,9 @@ from tetopt.cluster.tasks import run_tasks
 from tetopt.cluster.workers import check_choice, local_share, workers
 from tetopt.contents.content import Content
 from tetopt.contents.statistics import statistics
-from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.memory import meshing_bytes
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import file_shape, parse_crop
@@ -31,7 +31,6 @@ from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, 
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, warning
 from tetopt.job.options import DEFAULT_NODES, JobOptions, PartsOptions, stated_part
 from tetopt.job.plan import Plan
-from tetopt.job.predict import cropped_shape
 from tetopt.job.request import checksum
 from tetopt.job.source import Source
 from tetopt.job.task import Task
@@ -105,7 +104,11 @@ def _whole_bytes(plan: Plan) -> float:
 
 def _n_voxels(plan: Plan) -> int:
     """Return the number of voxels of the cropped image, by its header."""
-    return prod(cropped_shape(plan, (file_shape(plan.job.images[0]) or (0,))[:3]))
+    shape = (file_shape(plan.job.images[0]) or (0,))[:3]
+    if plan.job.crop is None:
+        return prod(shape)
+    bounds = zip(shape, parse_crop(plan.job.crop), strict=False)
+    return prod(len(range(length)[slice(*ends)]) for length, ends in bounds)
 
 
 def _unsupported_option(plan: Plan) -> str | None:
@@ -168,7 +171,7 @@ class PartsProgress(NamedTuple):
 def run_in_parts(
     task: Task, check: Callable[[Mesh], None], stop: Callable[[], bool], ends: float | None
 ) -> tuple[Parted, float]:  # fmt: skip
-    """Run or resume a mesh in parts; return the result, and the predicted memory of each worker's task, bytes.
+    """Run or resume a mesh in parts; return the result, and the memory of each worker's largest task, bytes.
 
     `check` gets the initial mesh before a part begins; the run ends once `stop` returns true, or at the time `ends` of
     `time.perf_counter`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.memory import next_bytes
 from tetopt.engine.meshing import (
     ERROR_REACHED,
     ERROR_RUNS,
@@ -30,12 +30,11 @@ from tetopt.engine.meshing import (
 from tetopt.engine.requirements import unexplained_by
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
-from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
+from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, time_words
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early, keep_early
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
-from tetopt.job.predict import stated_prediction
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.measure.fidelity import cell_labels
@@ -43,11 +42,13 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
-from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
+from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes
 from tetopt.system.files import check_space, kept_places
 
 CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
 LONG_SECONDS = 3.0  # above it, the kernels were compiled, not loaded
+FIRST_TOLD = 3  # iteration after which the time left is told: the first ones, with most exchanges, take longer
+PACE_OF = 2  # iterations: the last ones, by which it is estimated
 START_WORDS = "building the initial mesh"
 
 
@@ -65,6 +66,10 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     job, content, options = task.plan.job, task.source.content, task.plan.engine_options
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
+
+    def most_bytes(nodes: int) -> float:
+        return max(before[0], before[1] + bytes_of(content, nodes))
+
     begun: list[float] = []
     early: list[Path] = []
 
@@ -81,11 +86,12 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
         _check_room(task, initial)
         begun.append(time.perf_counter())
         started("kernels", KERNEL_WORDS)
-        note(_described(task, initial))
+        nodes = max(job.nodes or 0, len(initial.points)) if task.plan.order == 1 else len(initial.points)
+        note(f"{_described(task, initial)}; at most {memory_words(most_bytes(nodes))} of memory")
         prepare(lambda say: prepare_kernels(
             content, options["k_D"], "paper" if task.plan.mode == "paper" else "fast", task.plan.mode == "graded", say
         ))  # fmt: skip
-        started("optimise", "optimising", options["iterations"])
+        started("optimise", "optimising", options["iterations"], None if ends is None else ends - time.perf_counter())
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
         result = watched(kept, initial, options["iterations"], ends, stop, limit)
         _say_search(task, len(begun), result)
@@ -106,9 +112,8 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
         note("`start`: curved edges become straight, as there are no labels or mask for their nodes to follow")
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
-    n_bytes = max(before[0], before[1] + bytes_of(content, n_nodes))
-    predicted = {"prediction": stated_prediction(task.size), "memory": {"predicted_bytes": n_bytes}}
-    return Meshed(result, result.initial, seconds, predicted, early=early[-1] if early else None)
+    memory = {"predicted_bytes": most_bytes(n_nodes)}
+    return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
 
 
 def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
@@ -123,8 +128,7 @@ def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | 
     parted, n_bytes = run_in_parts(task, check, stop, ends)
     seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
     fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
-    predicted = {"prediction": {"task_bytes": n_bytes}}  # for each worker's largest task
-    return Meshed(parted.result, parted.result.initial, seconds, predicted, fields, is_kept=True)
+    return Meshed(parted.result, parted.result.initial, seconds, {"task_bytes": n_bytes}, fields, is_kept=True)
 
 
 def _check_room(task: Task, initial: Mesh) -> None:
@@ -173,8 +177,12 @@ def watched(
     def is_stopped() -> bool:
         return stop() or (limit is not None and limit.is_reached())
 
+    history: list[IterationRecord] = []
+
     def recorded(row: IterationRecord) -> None:
-        progress(f"iteration {row.iteration} of {iterations}: E {row.E:.4f}", row)
+        history.append(row)
+        left = left_words(history, iterations, max_seconds)
+        progress(f"iteration {row.iteration} of {iterations}: E {row.E:.4f}{left}", row)
 
     result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
     if iterations == 0:  # the initial mesh itself, not with nodes rounded to the sampling grid
@@ -186,6 +194,18 @@ def watched(
         words = ended_words(result.ended, "the current mesh")
         note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result
+
+
+def left_words(history: Sequence[IterationRecord], iterations: int, most_seconds: float | None) -> str:
+    """Return the time left at the pace of the last iterations, from the third on; before, an empty text."""
+    last = history[-1]
+    if last.iteration < FIRST_TOLD or last.iteration == iterations:
+        return ""
+    pace = (last.seconds - history[-1 - PACE_OF].seconds) / PACE_OF
+    left = pace * (iterations - last.iteration)
+    if most_seconds is not None:
+        left = min(left, max(most_seconds - last.seconds, 0.0))
+    return f", about {time_words(left)} left"
 
 
 def _say_search(task: Task, number: int, result: MeshingResult) -> None:

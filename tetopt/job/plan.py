@@ -362,6 +362,21 @@ def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
     return int(np.rint(many * corners))
 
 
+def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int | None:
+    """Return the number of nodes that target sizes take, for order 2 with mid-edge nodes; None without targets."""
+    if sizes is None or not sizes.has_target:
+        return None
+    return round(nodes_of_sizes(content, sizes)[0] * (QUADRATIC_NODES[content.image.ndim] if plan.order == 2 else 1.0))
+
+
+def expected_nodes(plan: Plan, content: Content) -> int:
+    """Return the requested number of nodes, or the usual one if only the run can tell."""
+    ndim, spacing = content.image.ndim, plan.job.spacing
+    if spacing is not None:
+        return round(2.0 * content.volume / spacing**ndim)  # two per block, in five-tet lattices one
+    return plan.job.nodes or DEFAULT_NODES[ndim]
+
+
 def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
     """Return the limits on sizes, if the options set any."""
     by_label = None if job.label_size is None else label_sizes_of(job.label_size, table)

@@ -10,12 +10,11 @@ from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
-from tetopt.job.events import started, warning
+from tetopt.job.events import note, started, warning
 from tetopt.job.in_parts import left_source, with_parts
 from tetopt.job.inputs import label_table, read_mesh, set_threads
 from tetopt.job.job import Job
-from tetopt.job.plan import Plan, changed, plan, with_numbers
-from tetopt.job.predict import size_of_run
+from tetopt.job.plan import Plan, changed, nodes_of_targets, plan, with_numbers
 from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
@@ -50,7 +49,7 @@ def read(job: Job) -> Task:
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
     >>> task = tetopt.read(tetopt.Job(images="small.nii.gz", output="small.vtu"))
-    >>> task.source.content.n_voxels, task.size.n_nodes
+    >>> task.source.content.n_voxels, task.plan.job.nodes
     (4096, 512)
     """
     checked = plan(job)
@@ -73,11 +72,11 @@ def read_planned(plan: Plan) -> Task:
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
     if by_label is not None:
         tell_label_sizes(by_label)
-    n_started = None if begun is None else len(begun.mesh.points)
-    size = size_of_run(plan, source.content, source.contrasts[0], n_started, sizes)
+    elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
+        note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
     request = requested(changed(plan.bare, parts=plan.division.n_parts))
-    return Task(plan, source, begun, sizes, size, request, by_label)
+    return Task(plan, source, begun, sizes, request, by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from tetopt.engine.cost import RunSize
 from tetopt.engine.loop import MeshingResult
 from tetopt.job.plan import Plan
 from tetopt.job.source import Source
@@ -34,8 +33,6 @@ class Task(NamedTuple):
         The mesh to start from.
     sizes : Sizes or None
         Targets and limits for the cells' edges.
-    size : RunSize
-        Numbers of voxels, nodes and iterations, from which time and memory are predicted.
     request : dict
         Everything that determines the outputs: options, checksums of files, the version.
     by_label : SizesByLabel, optional
@@ -45,7 +42,7 @@ class Task(NamedTuple):
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
     >>> task = tetopt.read(tetopt.Job(images="small.nii.gz", output="other.vtu", nodes=60))
-    >>> task.plan.mode, task.source.content.image.shape, task.size.n_nodes
+    >>> task.plan.mode, task.source.content.image.shape, task.plan.job.nodes
     ('graded', (8, 8, 8), 60)
     """
 
@@ -53,7 +50,6 @@ class Task(NamedTuple):
     source: Source
     started: MeshFile | None
     sizes: Sizes | None
-    size: RunSize
     request: dict[str, Any]
     by_label: SizesByLabel | None = None
 
@@ -74,8 +70,8 @@ class Meshed(NamedTuple):
         The initial mesh.
     seconds : dict of str to float
         `load`, until the optimisation, and `optimize`.
-    predicted : dict
-        The prediction before the run, as in run.json: `prediction`, and in `memory` the maximum in bytes.
+    memory : dict of str to float
+        The bound of the memory, in bytes, as in run.json: `predicted_bytes`, or in parts `task_bytes`.
     fields : dict of str to array, optional
         Fields of the cells, if they came with the mesh.
     is_kept : bool
@@ -94,7 +90,7 @@ class Meshed(NamedTuple):
     result: MeshingResult
     initial: Mesh
     seconds: dict[str, float]
-    predicted: dict[str, dict[str, Any]]
+    memory: dict[str, float]
     fields: dict[str, NDArray] | None = None
     is_kept: bool = False
     early: Path | None = None

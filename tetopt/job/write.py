@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tetopt.contents.content import continued
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import MeshingResult
-from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.job.events import note
 from tetopt.job.inputs import label_table
 from tetopt.job.model import (
@@ -26,7 +25,7 @@ from tetopt.job.model import (
     with_chosen_sets,
 )
 from tetopt.job.options import SolverOptions
-from tetopt.job.plan import stated_options
+from tetopt.job.plan import nodes_of_targets, stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
@@ -36,7 +35,6 @@ from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_label
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, measured_each, run_summary
-from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes
 from tetopt.system.files import TakenError, kept_places
@@ -141,8 +139,7 @@ def numbers_of(
         made = task.by_label
         rows = [{"label": row.label, "thickness": row.thickness, "target": row.edge} for row in made.layers]
         summary["label_sizes"] = {"nodes": made.nodes, "scale": made.scale, "labels": rows}
-    memory = {"peak_bytes": peak_bytes(), **came.predicted.get("memory", {})}
-    return summary | {"memory": memory, "prediction": came.predicted["prediction"]}
+    return summary | {"memory": {"peak_bytes": peak_bytes(), **came.memory}}
 
 
 def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
@@ -155,9 +152,8 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     if has_image and not source.content.is_plain:
         measures["contrasts"] = lambda: source.by_contrast(fields)
     if sizes is not None and sizes.has_target:
-        content, factor = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
         measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
-        measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * factor)
+        measures["nodes_of_sizes"] = lambda: nodes_of_targets(task.plan, source.content, sizes)
     if source.mask is not None:
         measures["dropped_components"] = lambda: result.n_dropped
         measures["dropped_volumes"] = lambda: {str(label): volume for label, volume in result.dropped.items()}

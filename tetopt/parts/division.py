@@ -7,7 +7,6 @@ from typing import NamedTuple, TypeVar
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.parts.rounds import expected_parts
 
 FEWEST_NODES_EACH = 100  # per part: half of 150 nodes are shared and fixed
 WORK_SUFFIX = ".work"  # of the work directory next to the mesh, appended to its name
@@ -46,10 +45,6 @@ class Division(NamedTuple):
                 f"`parts`: expected at most {most} for {nodes} nodes ({FEWEST_NODES_EACH} each), got {number}"
             )
         return number
-
-    def expected(self, image: Image, nodes: int) -> tuple[int, float]:
-        """Return the expected number of parts in a round and the bytes of each; InputError for too many."""
-        return expected_parts(image, nodes, self.checked_number(nodes))
 
 
 def work_folder(mesh: Path) -> Path:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from math import ceil, prod
+from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content
 from tetopt.contents.statistics import Statistics, statistics
 from tetopt.energy.sampling import grid_bits
-from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
 from tetopt.engine.fast import EXCHANGING_FRACTION
 from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.memory import part_bytes
 from tetopt.engine.requirements import checked_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -232,14 +232,6 @@ def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     fewest = ceil(_weights(index, mesh["cells"]).sum())
     return counts_of(max(run.request.n_parts, fewest), tuple(run.image.spacing * run.image.shape))
-
-
-def expected_parts(grid: Image, request_nodes: int, n_parts: int) -> tuple[int, float]:
-    """Estimate the number of parts in a round and the bytes of each, before there is a mesh."""
-    n_cells, n_voxels = CELLS_PER_NODE[3] * request_nodes, prod(grid.shape)
-    fewest = ceil(n_cells / MOST_CELLS + n_voxels / MOST_VOXELS)
-    number = prod(counts_of(max(n_parts, fewest), tuple(grid.spacing * grid.shape)))
-    return number, part_bytes(int(BOX_EXCESS * n_voxels / number), n_cells // number)
 
 
 def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:

@@ -128,28 +128,6 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     )
 
 
-def check_octree(content: Content, nodes: int, sizes: Sizes | None) -> None:
-    """Raise InputError as `octree_mesh`; build it only if its number of nodes matters: without targets and masks."""
-    limits = _block_limits(content, nodes, sizes)
-    _check_enough(content, nodes, sizes, limits)
-    if limits.target is None and content.inside is None:
-        octree_mesh(content, nodes, sizes)
-
-
-def least_nodes(content: Content, nodes: int, sizes: Sizes | None) -> float:
-    """Number of nodes of the coarsest octree that `nearest_octree` can make; an estimate for targets and in masks.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    limits = _block_limits(content, nodes, sizes)
-    if content.inside is not None:
-        limits = limits._replace(target=None)  # `_lighter` enlarges it
-    return max(_target_nodes(content, limits), _coarsest_nodes(content, nodes, limits))
-
-
 def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _BlockLimits) -> None:
     by_target = _target_nodes(content, limits)
     least = max(_fewest_nodes(content, limits), by_target)
