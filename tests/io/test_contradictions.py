@@ -79,7 +79,8 @@ def test_units_of_nrrd(tmp_path, name):
     np.testing.assert_allclose(image.spacing, steps, rtol=1e-12)
     np.testing.assert_allclose(image.to_world([0, 0, 0]), corner, rtol=1e-12, atol=1e-12)
     assert ("or in another unit?" in "".join(said)) == (name == "none")  # 10 m long
-    assert len(said) == (name == "none")
+    assert len(said) == (name in ("none", "of axes"))
+    assert ("it has no space" in "".join(said)) == (name == "of axes")
 
 
 def test_unit_of_no_length_in_nrrd(tmp_path):
@@ -222,7 +223,11 @@ NRRDS = {
         "spacings: 1 1 3\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n",
         "spacings are 1 x 1 x 3, but 2 x 2 x 2 by",
     ),
-    "equal": ("spacings: 2 2 2\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n", None),
+    "equal": (
+        "spacings: 2 2 2\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n",
+        "it has no space, which leaves left and right open",
+    ),
+    "mins and maxs alone": ("axis mins: 0 0 0\naxis maxs: 6 8 1000\n", "has no voxel size: assuming 1 mm"),
     "no size": ("", "has no voxel size: assuming 1 mm"),
     "unknown sizes": ("spacings: nan NaN nan\n", "has no voxel size: assuming 1 mm"),
     "an unknown size": ("spacings: 2 2 nan\n", "has no voxel size along 1 of 3 axes: assuming 1 mm"),
