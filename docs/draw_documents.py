@@ -42,7 +42,6 @@ COMMANDS = {
     "demo.png": "make measured, which shrinks slices.png of its comparison",
     "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
     "organ.png": "python docs/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
-    "tradeoff.png": "tetopt compare T1.nii.gz -o compared --nodes 5000 --tradeoff",
     "view.png": "tetopt view brain.vtu --image T1.nii.gz --html look.html, photographed in a browser",
 }
 

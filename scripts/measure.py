@@ -109,7 +109,7 @@ def listed(name: str) -> Callable[[Path], Any]:
 
 
 def comparison(folder: Path) -> dict[str, Any]:
-    """Reference, meshes by pipeline and order, and sweep of options of the comparison in `compared`."""
+    """Reference, and meshes by pipeline and order, of the comparison in `compared`."""
     report = json.loads((folder / "compared" / "report.json").read_text())
     meshes: dict[str, dict[str, Any]] = {}
     for order, results in (("1", report["pipelines"]), ("2", report["quadratic"])):
@@ -119,12 +119,7 @@ def comparison(folder: Path) -> dict[str, Any]:
             run = result["median"]
             times = {"seconds": run["seconds_total"], "peak_gb": run["peak_bytes"] / 1e9}
             meshes.setdefault(result["name"], {})[order] = mesh_summary(run) | times
-    sweep = [
-        {"option": row["option"], "value": row["value"], "is_default": row["is_default"], "order": row["order"]}
-        | mesh_summary(row["measured"])
-        for row in report["tradeoff"]
-    ]
-    return {"reference": report["reference"], "meshes": meshes, "tradeoff": sweep}
+    return {"reference": report["reference"], "meshes": meshes}
 
 
 def mesh_summary(measured: dict[str, Any]) -> dict[str, Any]:
@@ -158,13 +153,13 @@ class Measurement(NamedTuple):
     rows: Callable[[Path], Any]
 
 
-COMPARED = "-o compared --repeats 1 --curve ''"
+COMPARED = "-o compared --repeats 1"
 CGAL = "--pipeline 'cgal=$PYTHON $CGAL_LABELS {labels} -o {output} --size {size}'"
 MEASUREMENTS = {
     "mni152": Measurement(
         (
             f"tetopt compare $T1 {COMPARED} --nodes 5000 --pipelines tetopt,tetopt-uniform,pytetwild,bcc {CGAL} "
-            "--reference-dofs 1000000 --tradeoff",
+            "--reference-dofs 1000000",
         ),
         comparison,
     ),

@@ -12,7 +12,7 @@ REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference"
 KINDS = {
     "run": {"request", "history", "mesh_sha256"},
     "quality": {"quality", "n_turned"},
-    "report": {"pipelines", "quadratic", "headline"},
+    "report": {"pipelines", "quadratic", "reference"},
 }
 
 

@@ -18,7 +18,7 @@ import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.cli.run
 import tetopt.job.source
-import tetopt.report.summary
+import tetopt.measure.measures
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
 
 pytestmark = pytest.mark.deep
@@ -315,11 +315,11 @@ MEASURES = {  # where each is called, and its keys in run.json
     "edge_ratios": (tetopt.job.write, {"edges_over_target"}),
     "nodes_of_targets": (tetopt.job.write, {"nodes_of_sizes"}),
     "crowded_nodes": (tetopt.job.write, {"nodes_of_many_labels"}),
-    "mask_fidelity": (tetopt.report.summary, {"mask"}),
-    "label_fidelity": (tetopt.report.summary, {"labels"}),
-    "label_interfaces": (tetopt.report.summary, {"interfaces"}),
-    "label_contacts": (tetopt.report.summary, {"contacts"}),
-    "label_layers": (tetopt.report.summary, {"thickness"}),
+    "mask_fidelity": (tetopt.measure.measures, {"mask"}),
+    "label_fidelity": (tetopt.measure.measures, {"labels"}),
+    "label_interfaces": (tetopt.measure.measures, {"interfaces"}),
+    "label_contacts": (tetopt.measure.measures, {"contacts"}),
+    "label_layers": (tetopt.measure.measures, {"thickness"}),
     "by_contrast": (tetopt.job.source.Source, {"contrasts"}),
     "fields": (tetopt.job.source.Source, {"cells_without_voxel"}),
 }

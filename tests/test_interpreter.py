@@ -19,7 +19,7 @@ MODULES = sorted(name for name in sys.stdlib_module_names | packages_distributio
 PLANTED = "import os\nopen({path!r}, 'a').write(__name__ + ' ')\n"
 COMMANDS = {  # and the kernels' compilers: tests/test_kernels.py
     "a file read by a compiled library": "mesh a.nrrd -o {out}/a.vtu --nodes 60 --iterations 0",
-    "a pipeline": "compare a.nii -o {out}/compared --nodes 60 --pipelines mine --pipeline mine={program} --curve=",
+    "a pipeline": "compare a.nii -o {out}/compared --nodes 60 --pipelines mine --pipeline mine={program}",
     "workers whose tasks are processes": "cohort subjects.tsv -o {out}/cohort --nodes 60 --iterations 0 --workers 1",
 }
 NRRD = """NRRD0004

@@ -64,7 +64,7 @@ def numbers(tmp_path_factory):
 def test_kinds(numbers):
     """What the commands write is known for what it is, so that it is looked at; anything else is not."""
     assert [kind_of(each) for each in numbers] == ["run", "quality"]
-    assert kind_of({"pipelines": [], "quadratic": [], "headline": {}, "seconds": 1.0}) == "report"
+    assert kind_of({"pipelines": [], "quadratic": [], "reference": {}, "seconds": 1.0}) == "report"
     assert kind_of([1, 2]) is None
     assert kind_of({"quality": 1}) is None
 

@@ -12,9 +12,9 @@ import tetopt.engine.repair
 from tetopt.energy.sampling import overlap_of
 from tetopt.geometry.check import check_unfolded, manifold_problems
 from tetopt.io.formats import file_bytes
+from tetopt.measure.measures import fidelity
 from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import save_volume
-from tetopt.report.summary import fidelity
 
 pytestmark = pytest.mark.full
 SPREAD = 3  # of the asks of a run, those at which the quick test stops

@@ -5,7 +5,7 @@ import unicodedata
 
 import pytest
 
-from tetopt.io.text import plain
+from tetopt.io.text import last_line, plain
 
 
 @pytest.mark.parametrize("name", ["", "T1w", "Größe µm", "名前", "a\u00a0b", "[red]x[/]", '<x a="b">', "=1+2", "\\n"])
@@ -26,3 +26,9 @@ def test_of_all_letters_only_harmless_ones_are_left():
     shown.encode()
     kinds = {unicodedata.category(letter) for letter in set(shown)}
     assert not kinds & {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
+
+
+def test_last_lines():
+    assert last_line("a\n  b\tc \x1b[31m\n\n") == r"b c \x1b[31m"
+    assert last_line("\n") == ""
+    assert last_line("x" * 1000) == "x" * 300 + "..."

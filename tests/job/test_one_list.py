@@ -8,7 +8,7 @@ from commands import exit_code, numbers_in
 from scipy.ndimage import gaussian_filter
 
 import tetopt
-import tetopt.report.summary
+import tetopt.measure.measures
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
 from tetopt.cohort.numbers import row_of
@@ -47,7 +47,7 @@ def test_exit_code_and_files_and_cohort_agree(inputs, tmp_path, monkeypatch, cap
     words, measure = CASES[name]
     monkeypatch.chdir(inputs)
     if measure is not None:
-        monkeypatch.setattr(tetopt.report.summary, measure, failing)
+        monkeypatch.setattr(tetopt.measure.measures, measure, failing)
     key = "sub-1"
     subject_folder(tmp_path, key).mkdir(parents=True)
     mesh, numbers = subject_folder(tmp_path, key) / mesh_name(key, ".vtu"), numbers_path(tmp_path, key)

@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import time
-from functools import partial
 
-import numba
 import numpy as np
 import pytest
 
@@ -16,7 +13,7 @@ from tetopt.engine.paper import optimize_paper
 from tetopt.image import Image
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
-from tetopt.report.summary import SHOWN_VERSIONS, image_summary, measured_each, mesh_hash, run_summary
+from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary
 from tetopt.start.lattice import lattice_mesh
 from tetopt.system.files import save_json
 
@@ -109,24 +106,3 @@ def test_hash_is_over_points_and_cells(result):
     assert mesh_hash(Mesh(moved, cells)) != mesh_hash(result.mesh)
     assert mesh_hash(Mesh(points, np.roll(cells, 1, axis=1))) != mesh_hash(result.mesh)
     assert mesh_hash(Mesh(points, cells[::-1])) != mesh_hash(result.mesh)
-
-
-def test_measures_keep_to_the_number_of_threads():
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        assert measured_each({"a": numba.get_num_threads, "b": numba.get_num_threads}, None) == {"a": 1, "b": 1}
-    finally:
-        numba.set_num_threads(before)
-
-
-def test_the_first_error_ends_the_measures(monkeypatch):
-    """Those that were not begun are not; with a place for reasons, all others are taken."""
-    monkeypatch.setattr(numba, "get_num_threads", lambda: 1)
-    begun, broken, failed = [], {"a": lambda: 1 // 0}, {}
-    others = {name: partial(begun.append, name) for name in "bcdefgh"}
-    with pytest.raises(ZeroDivisionError):
-        measured_each(broken | {"slow": partial(time.sleep, 0.3)} | others, None)
-    assert begun == []
-    assert measured_each(broken | others, failed) == dict.fromkeys(others)
-    assert failed["a"].startswith("ZeroDivisionError")

@@ -15,7 +15,7 @@ import pytest
 import tetopt
 from tetopt.job.events import Event, listened
 from tetopt.study.child import run_in_child
-from tetopt.study.endings import AFTER_CRASHES, last_line
+from tetopt.study.endings import AFTER_CRASHES
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.child import signal_words
 
@@ -109,12 +109,6 @@ def test_signals_in_words():
     words = {-11: "signal 11, SIGSEGV", 139: "signal 11, SIGSEGV", -15: "signal 15, SIGTERM", -99: "signal 99"}
     assert {code: signal_words(code) for code in words} == words
     assert {signal_words(code) for code in (0, 1, 127, 130, 143, 255)} == {None}
-
-
-def test_last_lines():
-    assert last_line("a\n  b\tc \x1b[31m\n\n") == r"b c \x1b[31m"
-    assert last_line("\n") == ""
-    assert last_line("x" * 1000) == "x" * 300 + "..."
 
 
 @pytest.mark.deep

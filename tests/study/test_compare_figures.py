@@ -10,11 +10,8 @@ import tetopt
 from tetopt.energy.discretization import cell_E_D
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.report.figures import SliceView, save_figure
+from tetopt.report.figures import SliceView
 from tetopt.study.compare_figures import (
-    ERROR_TITLES,
-    curve_title,
-    curves_figure,
     cutaways,
     histograms_figure,
     labels_figure,
@@ -67,13 +64,18 @@ def test_label_marks_are_those_of_the_report():
         pipeline.median.measurement.labels.reverse()
     dice, distance = labels_figure(report).axes
     assert [text.get_text() for text in distance.get_xticklabels()] == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
-    for axes, name, n in ((dice, "dice", 4), (distance, "surface_mean_mm", 3)):
-        marks = {line.get_label(): line.get_xydata() for line in axes.lines}
+    for axes, name, n in ((dice, "dice", 4), (distance, "distance_mean", 3)):
+        marks = {line.get_label(): line.get_xydata() for line in axes.lines if line.get_markerfacecolor() != "none"}
         assert list(marks) == [p.title for p in done]
         for pipeline in done:
             values = {row.label: getattr(row, name) for row in pipeline.median.measurement.labels}
-            np.testing.assert_array_equal(marks[pipeline.title][:, 1], [values[k] for k in range(n)])
-            np.testing.assert_array_equal(np.rint(marks[pipeline.title][:, 0]), np.arange(n))
+            np.testing.assert_array_equal(marks[pipeline.title][:n, 1], [values[k] for k in range(n)])
+            np.testing.assert_array_equal(np.rint(marks[pipeline.title][:n, 0]), np.arange(n))
+        is_open = [line.get_markerfacecolor() == "none" and len(line.get_xdata()) > 0 for line in axes.lines]
+        own = axes.lines[is_open.index(True)].get_xydata()
+        assert sum(is_open) == 1  # of all meshes but the first
+        own_rows = {row.label: getattr(row, name) for row in done[0].median.measurement.own_labels}
+        np.testing.assert_array_equal(own[:n, 1], [own_rows[k] for k in range(n)])
 
 
 def test_histograms_are_those_of_the_report():
@@ -85,37 +87,6 @@ def test_histograms_are_those_of_the_report():
             histogram = getattr(pipeline.median.measurement, name)
             np.testing.assert_array_equal(outlines[pipeline.title].values, histogram.fraction)
             np.testing.assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
-
-
-@pytest.mark.parametrize("is_by_time", [False, True])
-def test_curves_are_those_of_the_report(is_by_time):
-    report = fake_report()
-    solved = report.curves[1].points[0].fem["0.3"].averages
-    solved["gauss"] = solved["gauss"]._replace(errors=solved["gauss"].errors._replace(displacement=None))
-    panels = np.array(curves_figure(report, is_by_time=is_by_time).axes).reshape(2, 3)
-    for row, nu in enumerate(("0.3", "0.45")):
-        for axes, (name, _) in zip(panels[row], ERROR_TITLES, strict=True):
-            assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-            lines = {line.get_label(): line for line in axes.lines}
-            assert list(lines) == [curve_title(curve) for curve in report.curves]
-            for curve in report.curves:
-                rows = [(p.n_nodes, p.fem[nu].averages["gauss"]) for p in curve.points]
-                expected = [(s.seconds if is_by_time else n, getattr(s.errors, name)) for n, s in rows]
-                shown = list(zip(*lines[curve_title(curve)].get_data(), strict=True))
-                assert shown == sorted(pair for pair in expected if pair[1] is not None)
-    kinds = [(line.get_marker(), line.get_linestyle()) for line in panels[0, 0].lines]
-    assert len(set(kinds)) == len(kinds)
-
-
-def test_curves_without_finite_elements_show_E_D(tmp_path):
-    report = fake_report()
-    for curve in report.curves:
-        for point in curve.points:
-            point.fem.clear()
-    (axes,) = curves_figure(report).axes
-    first = report.curves[0].points
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p.E_D_fraction for p in first])
-    save_figure(curves_figure(report._replace(curves=[])), tmp_path / "a.png", dpi=40)
 
 
 def test_bars_are_the_steps():
@@ -134,18 +105,6 @@ def test_bars_are_the_steps():
         assert texts[row] == f"{pipeline.median.seconds_total:.3g} s"
 
 
-def test_colours_do_not_depend_on_what_failed():
-    """A pipeline keeps its colour in every picture, whichever others have no line."""
-    report = fake_report()
-    first, *others = report.pipelines
-    fewer = report._replace(
-        pipelines=[with_runs(first, []), *others], curves=[each for each in report.curves if each.name != first.name]
-    )
-    whole, part = curves_figure(report).axes[0].lines, curves_figure(fewer).axes[0].lines
-    colours = [line.get_color() for line, curve in zip(whole, report.curves, strict=True) if curve.name != first.name]
-    assert colours == [line.get_color() for line in part]
-
-
 @pytest.mark.full
 def test_cutaways_are_drawn(small, tmp_path, opengl):
     image, both = small
@@ -155,3 +114,16 @@ def test_cutaways_are_drawn(small, tmp_path, opengl):
     assert pixels.shape == (2000, 2200)
     for part in (pixels[:1000, :1100], pixels[:1000, 1100:], pixels[1000:, :1100], pixels[1000:, 1100:]):
         assert part[200:800, 200:900].std() > 15.0
+
+
+def test_colours_do_not_depend_on_what_failed():
+    """A pipeline keeps its colour in every picture, whichever others have no line."""
+    report = fake_report()
+    first, *others = report.pipelines
+    fewer = report._replace(pipelines=[with_runs(first, []), *others])
+    whole, part = (
+        {line.get_label(): line.get_color() for line in labels_figure(each).axes[0].lines} for each in (report, fewer)
+    )
+    for each in finished(fewer):
+        assert part[each.title] == whole[each.title]
+    assert first.title not in part

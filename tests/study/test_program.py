@@ -17,11 +17,10 @@ from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets
-from tetopt.io.images import sha256
 from tetopt.study.child import run_in_child
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PipelineInput
-from tetopt.study.program import boxed, by_program, file_checksums, parse_program, pipelines_with
+from tetopt.study.program import boxed, by_program, parse_program, pipelines_with
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 1000, classes=3)
@@ -160,12 +159,12 @@ def test_limits_hold_for_what_it_starts(tmp_path):
 
 @pytest.mark.deep
 def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
-    """As a scheduler sends it: nothing is left running, no temporary folder stays, and finished runs are kept."""
+    """As a scheduler sends it: nothing is left running, and no temporary folder or report stays."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
     script, pid_file, temporary = tmp_path / "slow.sh", tmp_path / "pid", tmp_path / "temporary"
     script.write_text(f"echo $$ > {pid_file}.new; mv {pid_file}.new {pid_file}; exec sleep 600\n")
     temporary.mkdir()
-    words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--nodes", "150", "--curve", ""]
+    words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--nodes", "150"]
     words += ["--reference-dofs", "1000", "--pipelines", "bcc", "--pipeline", f"mine=sh {script} {{image}} {{output}}"]
     paths = os.pathsep.join([str(Path(tetopt.__file__).parents[1]), *filter(None, sys.path)])
     command = subprocess.Popen(
@@ -175,15 +174,13 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     try:
         wait_for(pid_file.exists, 300.0)  # kernels may have to be compiled
         command.terminate()
-        said = command.communicate(timeout=30.0)[1].decode()
+        command.communicate(timeout=30.0)
     finally:
         command.kill()
     assert command.returncode == 143
-    assert "continue with --resume" in said
     assert not is_running(int(pid_file.read_text()))
     wait_for(lambda: not list(temporary.iterdir()), 10.0)
-    assert (tmp_path / "out" / "runs" / "bcc-150-1.json").is_file()
-    assert not (tmp_path / "out" / "report.json").exists()
+    assert not list(tmp_path.glob("out/*"))
 
 
 @pytest.mark.parametrize(
@@ -206,12 +203,12 @@ def test_bad_commands(text, words, tmp_path, capsys):
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
     assert main(["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--pipeline", text]) == 2
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
-    assert not (tmp_path / "out" / "runs").exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_programs_in_the_comparison(tmp_path, opengl):
-    """A row as the others have; one that does not fill the box has all but the compression; resumed by its words."""
+    """A row as the others have; one that does not fill the box has all but the compression."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
     script, out = tmp_path / "mesher.py", tmp_path / "out"
     script.write_text(
@@ -219,10 +216,10 @@ def test_programs_in_the_comparison(tmp_path, opengl):
         "mesh = tetopt.lattice_mesh(image, nodes=round(2 / 3 * int(sys.argv[3])))\n"
         "tetopt.save_mesh(sys.argv[4], tetopt.Mesh(float(sys.argv[1]) * mesh.points, mesh.cells))\n"
     )
-    options = ["--nodes", "300", "--reference-dofs", "6000", "--curve", "", "--pipelines", "bcc"]
-    fine, small, again = (
+    options = ["--nodes", "300", "--reference-dofs", "6000", "--pipelines", "bcc"]
+    fine, small = (
         f"{name}={PYTHON} {script} {factor} {{image}} {{nodes}} {{output}}"
-        for name, factor in (("mine", "1"), ("other", "0.7"), ("other", "1.0"))
+        for name, factor in (("mine", "1"), ("other", "0.7"))
     )
     words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(out), *options]
     assert main([*words, "--pipeline", fine, "--pipeline", small]) == 0
@@ -232,24 +229,10 @@ def test_programs_in_the_comparison(tmp_path, opengl):
     assert report["options"]["programs"] == [
         {"name": name, "command": text.partition("=")[2]} for name, text in (("mine", fine), ("other", small))
     ]
-    assert report["versions"]["mine, SHA-256 of its files"].split(", ")[-1] == sha256(script)
     assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [True] * 3
     assert set(mine["median"]["fem"]) == set(bcc["median"]["fem"]) == {"0.3", "0.45"}
     assert mine["median"]["E_D_fraction"] == pytest.approx(bcc["median"]["E_D_fraction"], rel=0.1)
     assert other["median"]["fem"] == {}
     assert "of its boundary facets lie off" in other["median"]["not_compressed"]
     assert 0.0 < other["median"]["labels"][0]["dice"] < 1.0
-    assert "other was not compressed" in (out / "report.html").read_text()
-    (out / "runs" / "other-300-1.json").unlink()
-    assert main([*words, "--pipeline", fine, "--pipeline", again, "--resume"]) == 0
-    _, kept, other = json.loads((out / "report.json").read_text())["pipelines"]
-    assert kept["median"]["E_D"] == mine["median"]["E_D"]
-    assert set(other["median"]["fem"]) == {"0.3", "0.45"}
-
-
-def test_checksums_are_of_the_files_of_a_command_line(tmp_path):
-    """The program and every file; a shell's whole script, too long to be a file's name, is none."""
-    (tmp_path / "a.txt").write_text("x")
-    script = shlex.quote("echo hello; " * 100)
-    program = parse_program(f"mine={PYTHON} -c {script} {tmp_path / 'a.txt'} {{image}} {{output}}")
-    assert file_checksums(program) == [sha256(Path(sys.executable)), sha256(tmp_path / "a.txt")]
+    assert "other: not compressed: " in (out / "report.html").read_text()

@@ -8,14 +8,12 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from tetopt.cli.console import log, print_line, print_table
+from tetopt.cli.console import print_line, print_table
 from tetopt.cli.options import ForceOption, ImageArgument, NumberOptions
 from tetopt.job.options import Option
 from tetopt.report.tables import add_quality, new_table
-from tetopt.study.compare_criteria import number_text
-from tetopt.study.compare_headline import Headline, headline
+from tetopt.study.compare_table import columns_of, rows_of
 from tetopt.study.options import BaselineOptions, CompareOptions
 
 ResultsOption = Annotated[Path, Option("DIR", "Folder for the results.", letter="o")]
@@ -59,36 +57,21 @@ def compare_command(
     image_path: ImageArgument,
     output: ResultsOption,
     options: CompareOptions,
-    resume: Annotated[bool, Option(None, "Keep the finished runs of an interrupted comparison.")] = False,
     force: ForceOption = False,
 ) -> int:
     """Compare tetopt with the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
     from tetopt.study.compare_files import compare_image
 
     command = f"tetopt {' '.join(map(shlex.quote, context.obj))}"
-    try:
-        report = compare_image(image_path, output, options, command, resume=resume, force=force)
-    except KeyboardInterrupt:
-        log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs; continue with --resume")
-        return 130
-    _print_headline(headline(report))
-    n_pipelines = len(report.options.pipelines)
-    print_line(f"{output / 'report.html'}: {n_pipelines} pipelines, {report.seconds:.0f} s")
+    report = compare_image(image_path, output, options, command, force=force)
+    columns = [column for column in columns_of(report) if column.is_short]
+    rows = rows_of(report, columns)
+    table = new_table("", *(f"{column.group.split(' ')[0]}:\n{column.heading}" for column in columns))
+    for row in rows:
+        table.add_row(escape(row.title), *([text for text, _ in row.cells] or ["failed"]))
+    print_table(table)
+    for row in rows:
+        if row.failure is not None:
+            print_line(f"{row.title}: {row.failure}")
+    print_line(f"{output / 'report.html'}: {len(report.options.pipelines)} pipelines, {report.seconds:.0f} s")
     return 0
-
-
-def _print_headline(first: Headline) -> None:
-    """Print the page's first section: the pipelines, the main numbers, where tetopt is behind, and remarks."""
-    print_line(first.title)
-    for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
-        if claims:
-            table = Table(title=title, box=None, title_justify="left")
-            for heading in ("", "tetopt", "best peer", "", "tetopt relative to it", "", "  "):
-                table.add_column(heading, justify="left" if not heading.strip() else "right")
-            for each in claims:
-                numbers = (number_text(each.ours.value), number_text(each.other.value))
-                words = (escape(each.other_title), each.ratio_words, each.verdict, escape("; ".join(each.beside)))
-                table.add_row(escape(each.measure), *numbers, *words)
-            print_table(table)
-    for line in first.remarks:
-        print_line(line)

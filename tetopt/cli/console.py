@@ -216,7 +216,7 @@ def print_verdict(violated: Iterable[str], words: str) -> None:
 
 
 def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False) -> None:
-    """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured` (`tetopt.report.summary`).
+    """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured` (`tetopt.measure.measures`).
 
     `ndim` is the mesh's dimension; `word` is the name of the mask; `every` prints all labels and all their measures.
     """

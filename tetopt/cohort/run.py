@@ -22,7 +22,7 @@ from tetopt.cohort.layout import (
     publish,
     subject_folder,
 )
-from tetopt.study.endings import last_line
+from tetopt.io.text import last_line
 from tetopt.system.budget import peak_bytes
 from tetopt.system.child import signal_words, started, watched
 from tetopt.system.files import save_json, save_text

@@ -8,7 +8,7 @@ from typing import Any
 
 from tetopt.cluster.tasks import is_lost, lost_words, outcomes
 from tetopt.cohort.run import MOST_ATTEMPTS, Ended, SubjectTask, run_subject, set_down
-from tetopt.study.endings import last_line
+from tetopt.io.text import last_line
 from tetopt.system.budget import memory_words
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 NUMBERS_PER_LINE = 16  # the maximum in Abaqus
 # In a field's name, as some readers have lines of 256 characters: gmsh, and legacy VTK, percent-encoded there.
 MOST_NAME_CHARACTERS = 240
+LINE_CHARACTERS = 300  # of another program's line in a message, at most
 UNNAMED_FIELD = "unnamed"  # VTK cannot read back a file with a field without a name
 
 
@@ -52,6 +53,13 @@ def plain(text: str) -> str:
 
 def _escaped(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
+
+
+def last_line(text: str) -> str:
+    """Return the last non-empty line of another program's output, safe for a terminal."""
+    lines = text.strip().splitlines()
+    line = plain(" ".join(lines[-1].split())) if lines else ""
+    return line if len(line) <= LINE_CHARACTERS else line[:LINE_CHARACTERS] + "..."
 
 
 def file_name(name: str) -> str:

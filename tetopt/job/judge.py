@@ -19,10 +19,11 @@ from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
+from tetopt.measure.measures import fidelity
 from tetopt.measure.quality import Quality, quality
 from tetopt.measure.requirements import judged
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.report.summary import fidelity, size_summary
+from tetopt.report.summary import size_summary
 
 
 class Judgement(NamedTuple):

@@ -30,10 +30,11 @@ from tetopt.job.meshing import meshed
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
+from tetopt.measure.measures import measured_each
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
-from tetopt.report.summary import measured_each, model_summary
+from tetopt.report.summary import model_summary
 from tetopt.system.files import outputs_of_run, save_json
 
 

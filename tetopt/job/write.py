@@ -28,13 +28,14 @@ from tetopt.job.options import SolverOptions
 from tetopt.job.plan import nodes_of_targets, stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
+from tetopt.measure.measures import fidelity, measured_each
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MASK_TEXT
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
-from tetopt.report.summary import fidelity, measured_each, run_summary
+from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes
 from tetopt.system.files import TakenError, kept_places

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.io.text import last_line
 from tetopt.job.events import note
 from tetopt.mesh import Mesh
-from tetopt.study.endings import AFTER_CRASHES, Crashed, NotInstalled, last_line
+from tetopt.study.endings import AFTER_CRASHES, Crashed, NotInstalled
 from tetopt.study.pipelines import PipelineInput, Produced
 from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched

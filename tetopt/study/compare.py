@@ -6,17 +6,12 @@ measure every mesh: the sampler, the shape measures, and the compression test ag
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
 import os
 import platform
 import time
-from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from itertools import product
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,38 +25,19 @@ from tetopt.fem.reference import Reference, averaged, compare, nearest, referenc
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
-from tetopt.io.formats import save_mesh
-from tetopt.io.images import sha256
-from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
 from tetopt.measure.fidelity import cell_labels, label_fidelity, unexplained_of
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
-from tetopt.measure.thin import contact_totals, label_contacts
 from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
-from tetopt.model.fields import cell_fields
 from tetopt.model.mappings import ModulusMapping
 from tetopt.report.summary import versions
 from tetopt.study import compare_report as records
-from tetopt.study.child import run_in_child
-from tetopt.study.compare_report import Attempt, Measurement, Report, Settings, as_json, averages_of, from_json
-from tetopt.study.pipelines import UNTIMED_STEPS, Pipeline, PipelineInput
-from tetopt.study.program import file_checksums, pipelines_with
-from tetopt.study.tradeoff import tradeoff
-from tetopt.system.files import save_json
-from tetopt.system.incoming import own_bytes, text_of
-from tetopt.system.work_directory import LOCK_NAME, Layout, locked
-
-Facts = dict[str, Any]  # inputs of a comparison in addition to its settings, as JSON values
-# Settings that do not affect a finished run's numbers: the other pipelines, and limits that it has met. Its own number
-# of nodes and its program are part of its key, and so is the reference's size, once decided.
-FREE_SETTINGS = {
-    "nodes", "pipelines", "programs", "repeats", "curve", "tradeoff", "max_seconds", "max_bytes", "reference_seconds"
-}  # fmt: skip
-
-RUNS_NAME = "runs"  # the work directory
-RUNS = Layout("a comparison", rf"{LOCK_NAME}|reference\.json|[\w-]+-\d+(-quadratic)?-\d+\.(json|vtu)")
+from tetopt.study.child import Outcome, run_in_child
+from tetopt.study.compare_report import Measurement, Report, Settings, averages_of
+from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
+from tetopt.study.program import pipelines_with
 
 
 class Comparison(NamedTuple):
@@ -77,6 +53,13 @@ class Comparison(NamedTuple):
     command: str
 
 
+class MadeMesh(NamedTuple):
+    """The mesh of a pipeline's median run."""
+
+    mesh: Mesh
+    labels: NDArray[np.int64] | None  # (M,) its own, if it sets any
+
+
 class Standard(NamedTuple):
     """The reference that all meshes are measured against."""
 
@@ -87,17 +70,7 @@ class Standard(NamedTuple):
     coarse_labels: NDArray  # of the reference's voxels
     references: dict[str, Reference]  # by nu
     averages: tuple[str, ...]  # of a cell's moduli
-
-
-class Bench(NamedTuple):
-    """Data that all runs of a comparison share."""
-
-    comparison: Comparison
-    standard: Standard
-    pipelines: dict[str, Pipeline]
-    folder: Path  # of the runs' files
-    resume: bool
-    facts: Facts
+    dofs: int  # at most, of the reference
 
 
 def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
@@ -134,6 +107,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         nearest(labels, modulus).data,
         references,
         averages_of(settings),
+        dofs,
     )
 
 
@@ -145,55 +119,18 @@ def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings) ->
     return budget.dofs
 
 
-def _settled(comparison: Comparison, facts: Facts, runs: Path, *, resume: bool) -> Comparison:
-    """Decide the size of the reference, and store it in the runs' folder for `resume`."""
-    settings, path = comparison.settings, runs / "reference.json"
-    if settings.reference_dofs is None:
-        choice = facts | as_json({key: getattr(settings, key) for key in ("nus", "percent", "reference_seconds")})
-        before = _read_back(path) if resume else None
-        dofs = None if before is None or before[0] != choice else before[1]
-        if dofs is None:
-            dofs = reference_dofs(comparison.image, comparison.mapping, settings)
-            _write_down(path, [choice, dofs])
-        comparison = comparison._replace(settings=settings._replace(reference_dofs=dofs))
-    return comparison
-
-
-def _write_down(path: Path, content: Any) -> None:
-    """Write a file for `_read_back`, with a checksum, as files may be cut off or edited before they are resumed."""
-    save_json(path, {"content": content})
-    content = json.loads(path.read_text(encoding="utf-8"))["content"]  # as it will be read: non-finite numbers are null
-    save_json(path, {"content": content, "sha256": _checksum(content)})
-
-
-def _read_back(path: Path) -> Any:
-    """Read a file of `_write_down`; return None if it is missing or has changed."""
-    try:
-        row = json.loads(own_bytes(path))
-        return row["content"] if row["sha256"] == _checksum(row["content"]) else None
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return None
-
-
-def _checksum(content: Any) -> str:
-    """Return the checksum of a JSON file's content."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
 # Measures of one mesh.
 
 
 def measured(
-    standard: Standard, mesh: Mesh, percent: float, order: int = 1, of_cell: NDArray[np.int64] | None = None
+    standard: Standard, mesh: Mesh, percent: float, order: int = 1, own: NDArray[np.int64] | None = None
 ) -> Measurement:
     """Measure everything that is compared of a mesh with cells of this order, compressed by `percent` of its height.
 
-    `of_cell` (M,) are the labels that its pipeline gives the cells; where -1, or if None, those of most voxels.
+    `own` (M,) are the labels that its pipeline gives the cells; -1 is a cell without.
     """
-    image = standard.image
+    image, labels = standard.image, standard.labels
     moments = cell_moments(image, mesh)
-    owner = cell_of_voxel(image, mesh)
-    E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     fraction, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
     angles, angle_edges = np.histogram(dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0))
     try:
@@ -202,58 +139,27 @@ def measured(
     except InputError as error:
         not_compressed = str(error)
     references = standard.references if not_compressed is None else {}
+    majority = cell_labels(labels, mesh)
+    own = None if own is None else np.where(own < 0, majority, own)
     return Measurement(
         order=order,
         n_nodes=node_count(mesh.points, mesh.cells, order),
         n_corners=len(mesh.points),
         n_cells=len(mesh.cells),
-        E_D=E_D,
+        E_D=float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume,
         E_D_fraction=unexplained_of(*moments),
-        n_missed_voxels=int((owner < 0).sum()),
+        n_missed_voxels=int((cell_of_voxel(image, mesh) < 0).sum()),
         n_empty_cells=int((moments.n_voxels == 0).sum()),
         quality=quality(mesh.points, mesh.cells),
         rho_histogram=records.Histogram(edges.tolist(), fraction.tolist()),
         dihedral_histogram=records.Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
-        labels=_label_rows(standard, mesh, of_cell, moments.mean, owner),
+        labels=label_fidelity(labels, mesh, majority),
+        interfaces=label_interfaces(labels, mesh, majority),
+        own_labels=[] if own is None else label_fidelity(labels, mesh, own),
+        own_interfaces=[] if own is None else label_interfaces(labels, mesh, own),
         fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
         not_compressed=not_compressed,
     )
-
-
-def _label_rows(
-    standard: Standard,
-    mesh: Mesh,
-    of_cell: NDArray[np.int64] | None,
-    means: NDArray[np.float64],
-    owner: NDArray[np.int64],
-) -> list[records.LabelRow]:
-    """Return a row for each label: `LabelFidelity`, `LabelInterface`, contact, voxels of its cells, E_D in it."""
-    of_voxels = cell_labels(standard.labels, mesh)
-    of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
-    place = np.unique(standard.labels.data, return_inverse=True)[1].ravel()  # in the order of the rows
-    # Outside the mesh the label is 0, as in `label_fidelity`.
-    painted = np.where(owner >= 0, of_cell[owner], 0)
-    h = standard.image.data.ravel().astype(np.float64)
-    squares = np.bincount(place, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
-    total = float(np.var(h[owner.ravel() >= 0])) * np.count_nonzero(owner >= 0)
-    contacts = label_contacts(standard.labels, mesh, of_cell)
-    return [
-        records.LabelRow(
-            label=row.label, voxels=row.voxels, mesh_voxels=int(np.count_nonzero(painted == row.label)), dice=row.dice,
-            E_D_fraction=float(square) / total if total > 0.0 else None, is_lost=row.is_lost,
-            volume_mm3=row.volume, mesh_volume_mm3=row.mesh_volume,
-            surface_mean_mm=row.distance_mean, surface_p95_mm=row.distance_p95,
-            components=row.components, mesh_components=row.mesh_components,
-            area_ratio=surface.area_ratio, folded=surface.folded, nonmanifold_edges=surface.nonmanifold_edges,
-            nonmanifold_edges_two_labels=surface.nonmanifold_edges_two_labels,
-            one_layer_fraction=row.one_layer_fraction,
-            excess_contact_mm2=contact_totals([each for each in contacts if row.label in each.labels])["excess_mm2"],
-        )
-        for row, surface, square in zip(
-            label_fidelity(standard.labels, mesh, of_cell), label_interfaces(standard.labels, mesh, of_cell),
-            squares, strict=True,
-        )
-    ]  # fmt: skip
 
 
 def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> records.Simulation:
@@ -278,268 +184,122 @@ def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, 
 # All pipelines.
 
 
-def run(
-    folder: Path, comparison: Comparison, classes: Image, *, resume: bool = False
-) -> tuple[Report, dict[int, dict[str, Mesh]]]:
+def run(comparison: Comparison, classes: Image) -> tuple[Report, dict[int, dict[str, MadeMesh]]]:
     """Run and measure every pipeline, for linear and for quadratic cells.
 
-    Return the content of `report.json`, and the mesh of each pipeline's first run by order of the cells and by name.
+    Return the content of `report.json`, and each pipeline's mesh by order of the cells and by name.
 
     Parameters
     ----------
-    folder : Path
-        Each run writes its numbers and its mesh to `folder/runs`.
     comparison : Comparison
         Without labels, the pipelines that segment use `settings.classes` classes.
     classes : Image
         Materials for the rows by label and the interfaces: given labels, or classes of the voxels.
-    resume : bool
-        Keep finished runs of the same image, settings and versions.
 
     Raises
     ------
     InputError
-        As `prepared`; `folder` has the report of another comparison, which `resume` would replace; another run uses
-        `folder/runs`, or it contains foreign files.
+        As `prepared`.
     """
-    if resume:
-        _check_resumable(folder, comparison)
-    runs = folder / RUNS_NAME
-    with locked(runs, RUNS, runs):
-        return _run(runs, comparison, classes, resume=resume)
-
-
-def _run(
-    runs: Path, comparison: Comparison, classes: Image, *, resume: bool
-) -> tuple[Report, dict[int, dict[str, Mesh]]]:
-    """Run the comparison, with the work directory of its runs."""
     begin = time.perf_counter()
-    known = pipelines_with(comparison.settings.programs)
-    for name in comparison.settings.pipelines:  # before the hours that the others may take
+    settings = comparison.settings
+    known = pipelines_with(settings.programs)
+    for name in settings.pipelines:  # before the hours that the others may take
         if (words := known[name].missing) is not None:
             warning(words)
-    facts = _facts(comparison)
-    comparison = _settled(comparison, facts, runs, resume=resume)
-    image, settings = comparison.image, comparison.settings
-    standard = prepared(image, classes, comparison.mapping, settings)
-    pipelines = pipelines_with(settings.programs)
-    bench = Bench(comparison, standard, pipelines, runs, resume, facts)
+    standard = prepared(comparison.image, classes, comparison.mapping, settings)
     results: dict[int, list[records.PipelineResult]] = {1: [], 2: []}
-    meshes: dict[int, dict[str, Mesh]] = {1: {}, 2: {}}
-    curves = []
+    made: dict[int, dict[str, MadeMesh]] = {1: {}, 2: {}}
     for name, order in product(settings.pipelines, results):
-        attempts = _attempts(bench, name, order)
-        results[order].append(_summed_up(name, pipelines[name], attempts))
-        first = next((number for number, attempt in enumerate(attempts, 1) if attempt.run is not None), None)
-        if first is not None:
-            path = _run_path(bench, name, order, settings.nodes, first)
-            meshes[order][name] = load_mesh(path.with_suffix(".vtu")).mesh
-        curves.append(_curve(bench, results[order][-1], order))
-    sweep: list[records.TradeoffRow] = []
-    for order in results if settings.tradeoff else ():
-        sweep += tradeoff(image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of))
+        result, median = _result(comparison, standard, name, known[name], order)
+        results[order].append(result)
+        if median is not None:
+            made[order][name] = median
+    image = comparison.image
     report = Report(
         command=comparison.command,
         image=records.ImageFacts(comparison.image_source, image.shape, image.spacing.tolist(), image.variance),
         labels=comparison.label_source,
         mapping=comparison.mapping_words,
-        versions=versions() | _peers() | _programs(settings),
+        versions=versions() | _peers(),
         machine=_machine(),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
-        options=settings,
+        options=settings._replace(reference_dofs=standard.dofs),
         reference=_reference_grid(standard),
         pipelines=results[1],
         quadratic=results[2],
-        tradeoff=sweep,
-        curves=[curve for curve in curves if curve.points],
         seconds=time.perf_counter() - begin,
     )
-    return report, meshes
+    return report, made
+
+
+def _result(
+    comparison: Comparison, standard: Standard, name: str, pipeline: Pipeline, order: int
+) -> tuple[records.PipelineResult, MadeMesh | None]:
+    """Run a pipeline, several times if its result varies, until the first failure; return the median run's mesh."""
+    outcomes: list[Outcome] = []
+    done: list[tuple[records.PipelineRun, MadeMesh]] = []
+    while len(outcomes) < (comparison.settings.repeats if pipeline.is_random else 1):
+        outcome, made = _attempt(comparison, standard, pipeline, order)
+        outcomes.append(outcome)
+        if made is None:
+            break
+        done.append(made)
+    # The lower of the two in the middle, so that the numbers are those of one mesh.
+    median = sorted(done, key=lambda each: each[0].measurement.E_D)[(len(done) - 1) // 2] if done else (None, None)
+    result = records.PipelineResult(
+        name,
+        pipeline.title,
+        pipeline.kind,
+        pipeline.about,
+        outcomes[-1].failure,
+        outcomes[-1].reason,
+        crashes=[crash for each in outcomes for crash in each.crashes],
+        notes=list(dict.fromkeys(note for each in outcomes for note in each.notes)),
+        runs=[run for run, _ in done],
+        median=median[0],
+    )
+    return result, median[1]
+
+
+def _attempt(
+    comparison: Comparison, standard: Standard, pipeline: Pipeline, order: int
+) -> tuple[Outcome, tuple[records.PipelineRun, MadeMesh] | None]:
+    """Run a pipeline once and measure its mesh; return the outcome, and the run unless it failed."""
+    settings, title = comparison.settings, pipeline.title + (", quadratic" if order == 2 else "")
+    note(f"{title}, {settings.nodes} nodes")
+    job = PipelineInput(
+        comparison.image, comparison.labels, settings.nodes, settings.classes, settings.k_D, settings.iterations, order
+    )  # fmt: skip
+    made = run_in_child(pipeline.function, job, title, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes)
+    if made.mesh is not None:
+        try:
+            measurement = measured(standard, made.mesh, settings.percent, order, made.labels)
+        except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
+            made = made._replace(mesh=None, failure=f"its mesh cannot be measured: {error}", reason="error")
+    if made.mesh is None:
+        made = made._replace(failure=(made.failure or "").removeprefix(f"{pipeline.title}: "))
+        note(f"{title}: {made.failure}")
+        return made, None
+    total = sum(seconds for step, seconds in made.seconds.items() if step not in UNTIMED_STEPS)
+    note(f"{title}: {measurement.n_nodes} nodes, {total:.0f} s")
+    run = records.PipelineRun(made.seconds, total, made.peak_bytes, measurement)
+    return made, (run, MadeMesh(made.mesh, made.labels))
 
 
 def _machine() -> dict[str, int | str | None]:
     """Describe the machine and its load: times are unreliable if the load exceeds the number of cores."""
     load = f"{os.getloadavg()[2]:.1f}" if hasattr(os, "getloadavg") else None
     return {
-        "cores": os.cpu_count(), "load, mean of 15 minutes": load, "processor": _processor(),
-        "system": platform.platform(),
+        "cores": os.cpu_count(), "load, mean of 15 minutes": load, "system": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
     }  # fmt: skip
-
-
-def _processor() -> str:
-    """Return the processor's name, on Linux from /proc, as `platform` often lacks it."""
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        for line in lines:
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _check_resumable(folder: Path, comparison: Comparison) -> None:
-    """Raise InputError if the folder has the report of another comparison, which resuming would replace."""
-    path = folder / "report.json"
-    if not path.is_file():
-        return
-    try:
-        before = json.loads(text_of(path, "report"))
-        earlier = before["options"]["nodes"], before["image"]["sha256"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        earlier = None
-    if earlier != (comparison.settings.nodes, comparison.image_source.sha256):
-        raise InputError(f"{path}: belongs to another comparison (image or `nodes`); use another folder, or `force`")
 
 
 def _peers() -> dict[str, str]:
     """Return the versions of the installed peers."""
-    installed = {}
-    for name in ("pytetwild",):
-        with contextlib.suppress(PackageNotFoundError):
-            installed[name] = version(name)
-    return installed
-
-
-def _programs(settings: Settings) -> dict[str, str]:
-    """Return checksums of the files in the command lines of the user's programs, in place of versions."""
-    return {f"{each.name}, SHA-256 of its files": ", ".join(file_checksums(each)) for each in settings.programs}
-
-
-def _facts(comparison: Comparison) -> Facts:
-    """Return image, labels, moduli and versions, without the mapping's text, which may name a file that has changed."""
-    source = comparison.label_source
-    modulus = young_image(comparison.image, comparison.mapping).data
-    facts = {
-        "image": as_json(comparison.image_source),
-        "labels": as_json(source and source._replace(names={})),
-        "modulus_sha256": hashlib.sha256(modulus.tobytes()).hexdigest(),
-        "versions": versions() | _peers(),
-    }
-    return json.loads(json.dumps(facts))
-
-
-def _key(bench: Bench, name: str) -> str:
-    """Return a checksum of everything that a finished run's numbers depend on, without the other pipelines."""
-    settings = bench.comparison.settings
-    same = {key: value for key, value in as_json(settings._asdict()).items() if key not in FREE_SETTINGS}
-    program = [[each.command, file_checksums(each)] for each in settings.programs if each.name == name]
-    return _checksum([bench.facts, same, program])
-
-
-def _run_path(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Path:
-    """Return the path of a run's numbers; its mesh is next to it."""
-    return bench.folder / f"{name}-{nodes}{'-quadratic' if order == 2 else ''}-{repeat}.json"
-
-
-def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
-    """Run a pipeline, several times if its result varies, until the first failure."""
-    settings = bench.comparison.settings
-    attempts: list[Attempt] = []
-    while len(attempts) < (settings.repeats if bench.pipelines[name].is_random else 1):
-        attempts.append(_attempt(bench, name, order, settings.nodes, len(attempts) + 1))
-        if attempts[-1].failure is not None:
-            break
-    return attempts
-
-
-def _kept(path: Path, key: str) -> Attempt | None:
-    """Return a finished run's numbers if they are complete and belong to the same key and to the mesh next to them."""
-    content = _read_back(path)
-    if not isinstance(content, dict) or content.get("key") != key:
-        return None
-    try:
-        is_same = content["mesh_file_sha256"] == sha256(path.with_suffix(".vtu"))
-        return from_json(Attempt, content) if is_same else None
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return None
-
-
-def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Attempt:
-    """Run a pipeline once, or read its file if that is finished and has the same key."""
-    path = _run_path(bench, name, order, nodes, repeat)
-    title = bench.pipelines[name].title + (", quadratic" if order == 2 else "")
-    key = _key(bench, name)
-    kept = _kept(path, key) if bench.resume else None
-    if kept is not None:
-        note(f"{title}, {nodes} nodes: already finished")
-        return kept
-    note(f"{title}, {nodes} nodes")
-    comparison, settings = bench.comparison, bench.comparison.settings
-    job = PipelineInput(
-        comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations, order
-    )  # fmt: skip
-    outcome = run_in_child(
-        bench.pipelines[name].function, job, title, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes
-    )
-    failure = outcome.failure and outcome.failure.removeprefix(f"{bench.pipelines[name].title}: ")
-    attempt = Attempt(key, failure, outcome.notes, None, outcome.reason, list(outcome.crashes))
-    if outcome.mesh is not None:
-        try:
-            measurement = measured(bench.standard, outcome.mesh, settings.percent, order, outcome.labels)
-        except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
-            attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}", reason="error")
-    if outcome.mesh is None or attempt.failure is not None:
-        note(f"{title}: {attempt.failure}")
-        return attempt
-    mesh_path = path.with_suffix(".vtu")
-    fields = cell_fields(outcome.mesh, comparison.image)
-    fields |= {} if outcome.labels is None else {"label": outcome.labels}
-    save_mesh(mesh_path, outcome.mesh, fields)
-    total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
-    done = records.PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
-    _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
-    fraction = "none" if measurement.E_D_fraction is None else f"{measurement.E_D_fraction:.4f}"
-    note(f"{title}: {measurement.n_nodes} nodes, E_D fraction {fraction}, {total:.0f} s")
-    # Read back, so that a kept run and a new one are equal: non-finite numbers are None in both.
-    return from_json(Attempt, _read_back(path))
-
-
-def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> records.PipelineResult:
-    """Return a pipeline's entry in the report."""
-    runs = [attempt.run for attempt in attempts if attempt.run is not None]
-    failures = [attempt.failure for attempt in attempts if attempt.failure is not None]
-    notes = list(dict.fromkeys(note for attempt in attempts for note in attempt.notes))
-    crashes = [crash for attempt in attempts for crash in attempt.crashes]
-    reason = next((attempt.reason for attempt in attempts if attempt.failure is not None), None)
-    failure = failures[0] if failures else None
-    result = records.PipelineResult(name, shown.title, shown.kind, shown.about, failure, reason, crashes, notes, runs)
-    if not runs:
-        return result
-    median, low, high = (elementwise(runs, of) for of in (np.median, np.min, np.max))
-    return result._replace(median=median, low=low, high=high)
-
-
-def elementwise(rows: list[Any], of: Callable[[Any], Any]) -> Any:
-    """Combine nested numbers of several runs by `of`; anything else, or missing in one run, comes from the first."""
-    first = rows[0]
-    if hasattr(first, "_fields"):
-        return type(first)(*(elementwise(list(parts), of) for parts in zip(*rows, strict=True)))
-    if isinstance(first, dict):
-        return {k: elementwise([row[k] for row in rows], of) for k in first if all(k in row for row in rows)}
-    if isinstance(first, list):
-        same = all(len(row) == len(first) for row in rows)
-        return [elementwise(list(parts), of) for parts in zip(*rows, strict=True)] if same else first
-    if isinstance(first, bool) or any(not isinstance(row, int | float) for row in rows):
-        return first
-    value = float(of(rows))
-    return int(value) if all(isinstance(row, int) for row in rows) and value.is_integer() else value
-
-
-def _curve(bench: Bench, result: records.PipelineResult, order: int) -> records.Curve:
-    """Return errors by number of nodes, with one run per further number; failures are noted in `result`."""
-    runs = [] if result.median is None else [result.median]
-    settings = bench.comparison.settings
-    counts = sorted({max(round(factor * settings.nodes), 20) for factor in settings.curve} - {settings.nodes})
-    for nodes in counts if runs else ():
-        attempt = _attempt(bench, result.name, order, nodes, 1)
-        if attempt.run is not None:
-            runs.append(attempt.run)
-        else:
-            result.notes.append(f"at {nodes} nodes: {attempt.failure}")
-    points = [
-        records.CurvePoint(each.n_nodes, each.E_D_fraction, each.fem)
-        for each in sorted((run.measurement for run in runs), key=lambda each: each.n_nodes)
-    ]
-    return records.Curve(result.name, result.title, order, points)
+    installed = (each for each in PIPELINES.values() if each.missing is None)
+    return {package: version(package) for each in installed for package in each.packages}
 
 
 def _reference_grid(standard: Standard) -> records.ReferenceGrid:

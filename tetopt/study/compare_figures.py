@@ -1,15 +1,14 @@
-"""Pictures of a comparison of pipelines: slices through every mesh, histograms, curves, times, cutaways."""
+"""Pictures of a comparison of pipelines: slices through every mesh, cutaways, labels, histograms, times."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from tetopt.energy.discretization import cell_E_D
@@ -20,7 +19,7 @@ from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits, plain_text
 from tetopt.report.figures import SliceView, draw_edges, fill_cells
 from tetopt.report.scene import cutaway, save_scenes, view_of
-from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, PipelineRun, Report
+from tetopt.study.compare_report import PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
 
 # Okabe and Ito's palette, safe for colour blindness, without its yellow, which is invisible on white.
@@ -28,14 +27,6 @@ LINE_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00"
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LINE_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
 BAR_HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
-ERROR_TITLES = (
-    ("strain_energy", "strain energy"),
-    ("displacement", "displacement"),
-    ("interface_strain", "strain at interfaces"),
-)
-Value = Callable[[Measurement], Any]
-Place = tuple[float | None, float | None]  # of a point, across and up
-SHORT_RANGE = 12.0  # ratio of the ends of a logarithmic axis: below it, powers of ten are too few ticks
 
 
 def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
@@ -135,24 +126,28 @@ def histograms_figure(report: Report) -> Figure:
 def labels_figure(report: Report) -> Figure:
     """Plot Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, by pipeline.
 
-    Values are medians over the runs; a lost label has Dice 0 and no distance. Grey bars separate labels.
+    Filled marks are of labels of most voxels, open ones of the mesh's own. A lost label has Dice 0 and no
+    distance. Grey bars separate labels.
     """
     finished = _finished(report)
     voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
     order = sorted(voxels, key=lambda label: -voxels[label])
     figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    for axes, name in zip(panels, ("dice", "surface_mean_mm"), strict=True):
+    for axes, name in zip(panels, ("dice", "distance_mean"), strict=True):
         for k in range(0, len(order), 2):
             axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
         for place, (number, pipeline, run) in enumerate(finished):
-            values = {row.label: getattr(row, name) for row in run.measurement.labels}
             aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not overlap
-            points = [(k + aside, values[label]) for k, label in enumerate(order) if values.get(label) is not None]
-            axes.plot(
-                [x for x, _ in points], [y for _, y in points], linestyle="none", markersize=5, label=pipeline.title,
-                marker=LINE_MARKERS[number % len(LINE_MARKERS)], color=_style(number)["color"],
-            )  # fmt: skip
+            colour = _style(number)["color"]
+            for rows, face in ((run.measurement.own_labels, "none"), (run.measurement.labels, colour)):
+                values = {row.label: getattr(row, name) for row in rows}
+                points = [(k + aside, values[label]) for k, label in enumerate(order) if label in values]
+                axes.plot(
+                    [x for x, _ in points], [y for _, y in points], linestyle="none", markersize=5, color=colour,
+                    marker=LINE_MARKERS[number % len(LINE_MARKERS)], markerfacecolor=face,
+                    label=pipeline.title if rows is run.measurement.labels else None,
+                )  # fmt: skip
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     panels[0].set_ylabel("Dice")
     panels[0].set_ylim(-0.03, 1.03)
@@ -166,153 +161,6 @@ def labels_figure(report: Report) -> Figure:
     panels[1].set_xlabel("label (voxels)")
     _legend(figure, panels)
     return figure
-
-
-def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
-    """Plot errors by number of nodes, or by solve time: a row for each Poisson's ratio, a column for each error.
-
-    Axes are logarithmic, with the selected average of moduli; solid lines are quadratic cells, dashed lines linear
-    ones. Without any finite-element result, plot E_D as a fraction of the image's variance by number of nodes.
-    """
-    ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.fem}, key=float)
-    rows = max(len(ratios), 1)
-    columns = len(ERROR_TITLES) if ratios else 1
-    figure = Figure(figsize=(13.0 if ratios else 6.5, 3.9 * rows + 1.0), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for row, nu in enumerate(ratios):
-        for axes, (name, title) in zip(grid[row], ERROR_TITLES, strict=True):
-            _draw_curves(axes, report, _point_of_curve(report, nu, name, is_by_time))
-            axes.set_title(f"{title}, ν = {nu}", fontsize=11)
-        grid[row, 0].set_ylabel("relative error")
-    if not ratios:
-        _draw_curves(grid[0, 0], report, lambda point: (point.n_nodes, point.E_D_fraction))
-        grid[0, 0].set_ylabel("E_D, fraction of the image's variance")
-    for axes in grid[-1]:
-        axes.set_xlabel("processor seconds, assembly and solve" if is_by_time and ratios else "nodes in all")
-    _legend(figure, grid.ravel())
-    return figure
-
-
-def curve_title(curve: Curve) -> str:
-    """Return the label of a line."""
-    return f"{curve.title}, {ORDER_WORDS[curve.order]}"
-
-
-def _point_of_curve(report: Report, nu: str, name: str, is_by_time: bool) -> Callable[[CurvePoint], Place]:
-    def place(point: CurvePoint) -> Place:
-        if nu not in point.fem:
-            return None, None
-        solved = point.fem[nu].averages[report.options.average]
-        return solved.seconds if is_by_time else point.n_nodes, getattr(solved.errors, name)
-
-    return place
-
-
-def _draw_curves(axes: Axes, report: Report, place: Callable[[CurvePoint], Place]) -> None:
-    """Draw a line per pipeline and order of cells, through `place(point)`; values without a logarithm are left out."""
-    numbers = {pipeline.name: number for number, pipeline in enumerate(report.pipelines)}
-    for curve in report.curves:
-        places = [place(point) for point in curve.points]
-        points = sorted((x, y) for x, y in places if x and y is not None and y > 0.0)
-        if points:
-            number = numbers.get(curve.name, len(numbers))
-            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
-            axes.plot(
-                *zip(*points, strict=True), label=curve_title(curve), color=colour, markersize=6,
-                marker=LINE_MARKERS[number % len(LINE_MARKERS)], linestyle="-" if curve.order == 2 else "--",
-                markerfacecolor=colour if curve.order == 2 else "white",
-            )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        if high < SHORT_RANGE * low:
-            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
-            axis.set_major_formatter("{x:g}")
-        else:
-            axis.set_major_formatter(LogFormatterSciNotation())
-        axis.set_minor_formatter(NullFormatter())
-    axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
-
-
-def tradeoff_figure(report: Report) -> Figure:
-    """Plot the trade-offs of a graded mesh's options: E_D's fraction by mean rho, angles and, if simulated, errors.
-
-    Each option is a line with its values, with a star at the defaults; other pipelines' medians are single points.
-    """
-    nus = sorted({nu for row in report.tradeoff for nu in row.measured.fem}, key=float)[:1]
-    orders = sorted({row.order for row in report.tradeoff})
-    average = report.options.average
-    panels: list[tuple[str, int, Value]] = [
-        ("mean rho (1/3: regular)", 1, lambda mesh: mesh.quality.mean_rho),
-        ("dihedral angles: smallest (filled), 1st percentile (open)", 1, lambda mesh: mesh.quality.min_dihedral),
-        *(
-            (f"{title} error, ν = {nu}, {ORDER_WORDS[order]} cells", order, _error(nu, average, name))
-            for order in orders
-            for nu in nus
-            for name, title in ERROR_TITLES
-            if all(_error(nu, average, name)(row.measured) for row in report.tradeoff)
-        ),
-    ]
-    columns = 3 if len(panels) > 2 else len(panels)
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.9 * columns, 4.3 * rows + 0.6), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for number, (axes, (title, order, value)) in enumerate(zip(grid, panels, strict=False)):
-        _draw_tradeoff(axes, report, order, value)
-        if number == 1:
-            _draw_tradeoff(axes, report, order, lambda mesh: mesh.quality.p1_dihedral, is_open=True)
-            axes.set_ylim(bottom=0.0)
-        axes.set_title(title, fontsize=10)
-        axes.set_xscale("log")
-        axes.set_xlabel("E_D, fraction of the image's variance")
-        low, high = axes.get_xlim()
-        if high < SHORT_RANGE * low:
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    _legend(figure, grid[: len(panels)])
-    return figure
-
-
-def _error(nu: str, average: str, name: str) -> Value:
-    return lambda mesh: getattr(mesh.fem[nu].averages[average].errors, name) if nu in mesh.fem else None
-
-
-def _draw_tradeoff(axes: Axes, report: Report, order: int, value: Value, is_open: bool = False) -> None:
-    """Draw a line through the meshes of each option, with its values; hollow and without text if open."""
-    of_order = [row for row in report.tradeoff if row.order == order]
-    options = list(dict.fromkeys(row.option for row in of_order))
-    for number, option in enumerate(options):
-        rows = [row for row in of_order if row.option == option]
-        points = [(row.measured.E_D_fraction, value(row.measured)) for row in rows]
-        style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
-        axes.plot(*zip(*points, strict=True), marker=LINE_MARKERS[number], markersize=5, linewidth=1.2, **style)
-        for row, point in zip(rows, points, strict=True):
-            if not (is_open or row.is_default):
-                _annotate(axes, f"{row.value:.3g}", point, (4, 3), style["color"])
-    default = next(row.measured for row in of_order if row.is_default)
-    place: tuple[Any, Any] = (default.E_D_fraction, value(default))
-    axes.plot(
-        *place, marker="*", markersize=15, color="black", linestyle="none", zorder=5,
-        markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
-    )  # fmt: skip
-    for pipeline in report.pipelines if order == 1 else report.quadratic:
-        run = pipeline.median
-        if pipeline.kind != "tetopt" and run is not None and run.measurement.E_D_fraction:
-            place = (run.measurement.E_D_fraction, value(run.measurement))
-            if place[1] is None:  # not compressed
-                continue
-            axes.plot(*place, marker="x", color="#666666", markersize=6, zorder=4)
-            if not is_open:
-                _annotate(axes, pipeline.title, place, (5, -9), "#444444")
-
-
-def _annotate(axes: Axes, text: str, point: tuple[Any, Any], offset: tuple[int, int], colour: Any) -> None:
-    axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, color=colour)
 
 
 def timing_figure(report: Report) -> Figure:

@@ -1,22 +1,21 @@
-"""Records of `report.json` and the files in `runs`: written as objects, and read back when resuming."""
+"""Records of `report.json`."""
 
 from __future__ import annotations
 
-from types import UnionType
-from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple
 
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors, OwnError
+from tetopt.measure.fidelity import LabelFidelity
+from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
 
-# The files are flatter than the records: the keys of these fields' values are among those of the record itself,
-INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
-# and these fields are left out where they are None.
-OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")
+# The file is flatter than the records: the keys of these fields' values are among those of the record itself.
+INLINE_FIELDS = ("measurement", "source", "by_nu")
 ORDER_WORDS = {1: "linear", 2: "quadratic"}
 
 
@@ -35,8 +34,6 @@ class Settings(NamedTuple):
     average: str = DEFAULT_AVERAGE  # of a cell's moduli, in addition to Eq. (2)'s mean
     reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
     reference_seconds: float = 120.0  # time limit of the reference without `reference_dofs`, for all of `nus`
-    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, over `nodes`, in addition to 1
-    tradeoff: bool = False  # whether tetopt's options are swept around its defaults
     max_seconds: float = 3600.0  # of one run of a pipeline
     max_bytes: int | None = None  # of one run, resident
 
@@ -70,32 +67,6 @@ class Histogram(NamedTuple):
     fraction: list[float]
 
 
-class LabelRow(NamedTuple):
-    """Fidelity of a mesh to one label, by voxels painted by the cells, and measures of the label's surface.
-
-    As in `tetopt.measure.fidelity.LabelFidelity` and `tetopt.measure.interfaces.LabelInterface`.
-    """
-
-    label: int
-    voxels: int
-    mesh_voxels: int
-    dice: float
-    E_D_fraction: float | None  # the label's part of E_D, over the image's variance; None in an image without any
-    is_lost: bool
-    volume_mm3: float
-    mesh_volume_mm3: float
-    surface_mean_mm: float | None  # None if the label has no surface in the mesh
-    surface_p95_mm: float | None
-    components: int
-    mesh_components: int
-    area_ratio: float | None  # of its surface over that of its smoothed voxels; None without a surface, as the next
-    folded: float | None
-    nonmanifold_edges: int
-    nonmanifold_edges_two_labels: int
-    one_layer_fraction: float | None  # None if no cell has it
-    excess_contact_mm2: float  # with all other labels, over 1.2 times the voxels'
-
-
 class Solved(NamedTuple):
     """The compression of a mesh with one average of the moduli, and its errors against the reference."""
 
@@ -127,30 +98,21 @@ class Measurement(NamedTuple):
     quality: Quality
     rho_histogram: Histogram
     dihedral_histogram: Histogram  # degrees
-    labels: list[LabelRow]
+    labels: list[LabelFidelity]  # each cell has the label of most of its voxels
+    interfaces: list[LabelInterface]
+    own_labels: list[LabelFidelity]  # the same with the mesh's own labels of cells; empty without
+    own_interfaces: list[LabelInterface]
     fem: dict[str, Simulation]  # by nu; empty if the mesh cannot be compressed
     not_compressed: str | None = None  # why
 
 
 class PipelineRun(NamedTuple):
-    """One execution of a pipeline that gave a mesh; also the median, lowest or highest of several, by number."""
+    """One execution of a pipeline that gave a mesh."""
 
     seconds: dict[str, float]  # by step
     seconds_total: float
     peak_bytes: int
     measurement: Measurement
-
-
-class Attempt(NamedTuple):
-    """Content of a file in `runs`."""
-
-    key: str  # of all that the numbers depend on
-    failure: str | None
-    notes: list[str]
-    run: PipelineRun | None  # None after a failure
-    reason: str | None = None  # of the failure, as `tetopt.study.child.Reason`
-    crashes: list[str] = []  # noqa: RUF012 - never modified; of the run and of the one it repeats
-    mesh_file_sha256: str | None = None
 
 
 class PipelineResult(NamedTuple):
@@ -165,36 +127,7 @@ class PipelineResult(NamedTuple):
     crashes: list[str]  # of all runs; each run was repeated once
     notes: list[str]
     runs: list[PipelineRun]
-    median: PipelineRun | None = None  # None if no run gave a mesh, as for the next two
-    low: PipelineRun | None = None
-    high: PipelineRun | None = None
-
-
-class TradeoffRow(NamedTuple):
-    """A mesh with one option of the graded mesh changed."""
-
-    order: int
-    option: str
-    value: float
-    is_default: bool
-    measured: Measurement
-
-
-class CurvePoint(NamedTuple):
-    """Errors at one number of nodes."""
-
-    n_nodes: int  # in all
-    E_D_fraction: float | None
-    fem: dict[str, Simulation]  # by nu
-
-
-class Curve(NamedTuple):
-    """A pipeline's errors by number of nodes, with cells of one order."""
-
-    name: str
-    title: str
-    order: int
-    points: list[CurvePoint]
+    median: PipelineRun | None  # the run of the median E_D, the lower of two; None if no run gave a mesh
 
 
 class ImageFacts(NamedTuple):
@@ -237,8 +170,6 @@ class Report(NamedTuple):
     reference: ReferenceGrid
     pipelines: list[PipelineResult]  # meshes of the requested number of nodes, with linear cells
     quadratic: list[PipelineResult]  # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
-    tradeoff: list[TradeoffRow]
-    curves: list[Curve]
     seconds: float
 
 
@@ -256,24 +187,7 @@ def as_json(value: Any) -> Any:
         for name, item in value._asdict().items():
             if name in INLINE_FIELDS:
                 row |= as_json(item) or {}
-            elif item is not None or name not in OPTIONAL_FIELDS:
+            else:
                 row[name] = as_json(item)
         return row
     return [as_json(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def from_json(kind: Any, value: Any) -> Any:
-    """Restore a value of the type `kind` from `as_json`; raise KeyError, TypeError or AttributeError otherwise."""
-    arguments = get_args(kind)
-    if value is None:
-        return None
-    if get_origin(kind) is UnionType:  # X | None
-        return from_json(arguments[0], value)
-    if get_origin(kind) is list:
-        return [from_json(arguments[0], item) for item in value]
-    if get_origin(kind) is dict:
-        return {key: from_json(arguments[1], item) for key, item in value.items()}
-    if hasattr(kind, "_fields"):
-        hints = get_type_hints(kind).items()
-        return kind(*(from_json(hint, value if name in INLINE_FIELDS else value[name]) for name, hint in hints))
-    return value

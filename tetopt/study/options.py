@@ -42,10 +42,6 @@ class ComparedOptions:
     ] = None
     k_D: Annotated[float, Option("K", "Weight of the image on uniform meshes.", "k-d")] = DEFAULT_SETTINGS.k_D
     classes: ClassesOption = DEFAULT_SETTINGS.classes
-    curve: Annotated[str, Option("F,...", "Node counts of the error curves, as fractions of N; empty for none.")] = (
-        ",".join(f"{factor:g}" for factor in DEFAULT_SETTINGS.curve)
-    )
-    tradeoff: Annotated[bool, Option(None, "Sweep tetopt's options around its defaults: about 20 more runs.")] = False
     part: BoxPart = WHOLE_BOX
 
 
@@ -97,7 +93,7 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
             nodes=self.nodes, pipelines=tuple(names), programs=programs,
             repeats=self.repeats, classes=self.classes, k_D=self.k_D, reference_dofs=self.reference_dofs,
             reference_seconds=self.reference_seconds or DEFAULT_SETTINGS.reference_seconds,
-            curve=_parse_curve(self.curve), tradeoff=self.tradeoff, average=self.average, max_seconds=self.max_seconds,
+            average=self.average, max_seconds=self.max_seconds,
             max_bytes=None if self.max_gb is None else int(self.max_gb * BYTES_PER_GB),
         )  # fmt: skip
 
@@ -125,13 +121,3 @@ def _programs(texts: list[str]) -> tuple[Program, ...]:
     if twice := [name for number, name in enumerate(names) if name in names[:number]]:
         raise InputError(f'`pipeline`: expected unique names, got "{twice[0]}" again; use another name')
     return programs
-
-
-def _parse_curve(text: str) -> tuple[float, ...]:
-    try:
-        factors = tuple(float(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        factors = (0.0,)
-    if any(not 0.0 < factor < 100.0 for factor in factors):
-        raise InputError(f'`curve`: expected fractions of the node count, such as "0.25,0.5,2", got "{text}"')
-    return factors

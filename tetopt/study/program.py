@@ -6,7 +6,6 @@ runs in the current folder of `tetopt`; image, labels and mesh are in a temporar
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import shutil
@@ -26,11 +25,12 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.io.images import save_image, sha256
+from tetopt.io.images import save_image
 from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
+from tetopt.io.text import last_line
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
-from tetopt.study.endings import Crashed, last_line
+from tetopt.study.endings import Crashed
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
@@ -229,13 +229,6 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
     world = image.to_world(points / image.spacing)
     note = f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
     return Mesh(world, oriented(world, cells)), every[~is_flat][kept], [note]
-
-
-def file_checksums(program: Program) -> list[str]:
-    """Return the SHA-256 of the program, and of every file in its command line, such as a script."""
-    files = (shutil.which(word) or word for word in shlex.split(program.command))
-    # With os.path, as Path.is_file fails for words too long for a name, such as a whole shell script.
-    return [sha256(Path(name)) for name in files if os.path.isfile(name)]
 
 
 def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:

@@ -1,6 +1,6 @@
 """Work directories: the files of unfinished runs on disk, which are not trusted until they are checked.
 
-A cohort (OUT/.work), a mesh in parts (MESH.work) and a comparison (OUT/runs) each have one. Only the owner can open it
+A cohort (OUT/.work) and a mesh in parts (MESH.work) each have one. Only the owner can open it
 (0700), and its manifest lists the names that tetopt writes and removes there. A run begins only if it contains nothing
 but files and folders with these names: no links, pipes, devices or other files. It is opened, checked and removed by
 its descriptor, which no link can redirect; Windows has no descriptors of folders, so paths are checked there instead.

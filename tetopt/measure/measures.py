@@ -1,0 +1,90 @@
+"""Measures of a mesh against mask and labels, computed at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.contents.content import Content, content, continued
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+from tetopt.measure.interfaces import label_interfaces
+from tetopt.measure.thin import contact_totals, label_contacts, label_layers
+from tetopt.mesh import Mesh
+
+
+def fidelity(
+    labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None,
+    what: Content | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure how well a mesh represents a mask and labels.
+
+    Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a `LabelInterface` in
+    `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and their sums in `contact_totals`.
+    Entries of missing images are omitted. With a mask, labels count only inside it. `of_cell` (M,) is the label of each
+    cell, by default that of most of its voxels; for `failed` see `measured_each`; `what` is the content with the levels
+    of these labels, if known.
+    """
+    measures: dict[str, Callable[[], Any]] = {}
+    if mask is not None:
+        measures["mask"] = lambda: mask_fidelity(mask, mesh)
+    if labels is not None:
+
+        def own() -> NDArray[np.int64]:
+            return cell_labels(continued(labels, mask), mesh) if of_cell is None else of_cell
+
+        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask)
+        if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
+            measures["thickness"] = lambda: label_layers(_with_levels(what, labels, mask), mesh, own())
+        measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
+        measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
+    measured = measured_each(measures, failed)
+    thickness = measured.pop("thickness", {})
+    if "labels" in measured:
+        columns = ("thickness_voxels", "thickness_mesh", "edge", "cells_across")
+        measured["labels"] = [
+            row._replace(**dict(zip(columns, thickness.get(row.label, row[-4:]), strict=True)))
+            for row in measured["labels"]
+        ]
+    if "contacts" in measured:
+        measured["contact_totals"] = contact_totals(measured["contacts"])
+    return measured
+
+
+def _with_levels(what: Content | None, labels: Image, mask: Image | None) -> Content:
+    """Return the content if it has levels of labels, or else create one of the labels alone with levels."""
+    return what if what is not None and what.memberships is not None else content(labels, labels, mask)
+
+
+def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:
+    """Compute measures in parallel; return their results by name.
+
+    With `failed`, a measure that raises an error is omitted and its reason is noted there, so that the others complete.
+    """
+    measured, n_threads = {}, numba.get_num_threads()
+
+    def limited(measure: Callable[[], Any]) -> Any:
+        numba.set_num_threads(n_threads)  # which numba keeps for each thread of Python
+        return measure()
+
+    threads = ThreadPoolExecutor(n_threads)
+    try:
+        taken = {name: threads.submit(copy_context().run, limited, measure) for name, measure in measures.items()}
+        for name, each in taken.items():
+            try:
+                measured[name] = each.result()
+            except Exception as error:
+                if failed is None:
+                    raise
+                words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+                failed[name] = words.removesuffix(": ")
+    finally:  # an interrupted run, or one that failed, does not begin the rest
+        threads.shutdown(wait=False, cancel_futures=True)
+    return measured
