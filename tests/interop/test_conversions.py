@@ -143,6 +143,7 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("meshio", meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]), "found tetra cells of both order 1 and"),
         ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
         ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
+        ("meshio", meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]), "must lie in the plane z = 0"),  # one off it
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, but it has 0\.\.9"),
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 integers each, got float64"),
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 integers each, got .*1, 3"),
