@@ -27,7 +27,6 @@ import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
-from tetopt.errors import FORMER_NAMES
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import agreed, sentences, tell, unmet
 from tetopt.job.events import listened
@@ -1030,11 +1029,3 @@ def test_an_error_of_a_million_letters_is_cut(capsys):
     assert error.startswith("tetopt: a.txt, line 3: expected a label, got x")
     assert error.endswith("x; mend it\n")
     assert len(error) < 500
-
-
-@pytest.mark.parametrize(("former", "now"), FORMER_NAMES.items())
-def test_a_former_name_is_refused_with_that_of_now(former, now, capsys):
-    words = ["mesh", "a.nii", "-o", "a.vtu", "--" + former.replace("_", "-"), "9"]
-    assert (exit_code(*words), f"(Possible options: --{now.replace('_', '-')})" in capsys.readouterr().err) == (2, True)
-    with pytest.raises(tetopt.InputError, match=f"unknown option '{former}'; did you mean {now}"):
-        tetopt.Job.from_json(json.dumps({former: 9}))

@@ -282,36 +282,3 @@ def test_mutants_are_of_code_and_tests_that_are_there():
             if not is_there or text_of(ROOT / names[0]).count(mutant["old"]) != 1:
                 stale.append((path.name, mutant["file"], mutant["old"]))
     assert stale == []
-
-
-# Terms that the glossary has replaced, as names and in texts, and what they are called now. Verbs are none of them:
-# cells share a facet.
-OLD_NAMES = {
-    "missed": "violated", "promise": "requirement", "promises": "requirements", "law": "mapping", "laws": "mappings",
-    "rings": "stars", "stranger": "untrusted", "strangers": "untrusted",
-}  # fmt: skip
-# n_rings: of blocks around a divided one; missed: numbers that are not reached, voxels outside; _law: of elasticity.
-OTHER_NAMES = {"n_rings", "n_missed_voxels", "NODES_MISSED", "TARGETS_MISSED", "_law"}
-OLD_TERMS = {
-    r"\b(a|A|its|this) promise\b|\bpromises? (is|are) missed\b|\bpromises? missed\b": "requirement, violated",
-    r"\b([tT]he|[aA]|[nN]o) floor\b(?! that is not above)|\bfloor on angles\b": "minimum dihedral angle",
-    r"\b[sS]hares? of (the|its|own|cells|edges|a)\b|\bE_D_share|\bE_D.s share\b": "fraction",
-    r"\b(a|A|the|The) law\b(?! of (total|its own))|\b[lL]aws (of|and|are)\b|\bLAW\b": "modulus mapping",
-    r"\b[sS]trangers?\b": "untrusted",
-    r"\b(node's|its|their|the) rings?\b|\bring_(start|cells|energy)\b|\b1-ring\b": "star",
-    r"\b[pP]ieces? of (its|the|a label's) (voxels|cells|mask)\b": "connected component",
-    r'--size-max\b|(?<!")\bsize_max\b': "--edge-size, edge_size",
-}
-
-
-def test_a_thing_has_the_name_that_the_glossary_gives_it():
-    """No old term, in any text or name."""
-    said = {}
-    for path in [*SOURCES, *DOCUMENTS]:
-        text = text_of(path)
-        found = {match[0]: new for old, new in OLD_TERMS.items() for match in re.finditer(old, text)}
-        names = set(re.findall(r"\b[A-Za-z_]\w*\b", text)) - OTHER_NAMES if path.suffix == ".py" else set()
-        parts = {(name, part) for name in names if "_" in name for part in name.lower().split("_")}
-        found |= {name: OLD_NAMES[part] for name, part in parts if part in OLD_NAMES}
-        said |= {path.name: found} if found else {}
-    assert said == {}

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -173,24 +170,6 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     assert numbers["ended"] == "max_gb"
     assert "memory limit reached: the current mesh is kept" in capsys.readouterr().err
     tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
-
-
-@pytest.mark.deep
-@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
-@pytest.mark.parametrize("megabytes", [1000])
-def test_a_limit_that_libraries_cannot_live_with_is_said(tmp_path, megabytes):
-    """`ulimit -v`: no traceback and no exit in the midst of a library."""
-    program = (
-        f"import resource, sys; resource.setrlimit(resource.RLIMIT_AS, ({megabytes * 10**6},) * 2); "
-        "from tetopt.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
-    words = [sys.executable, "-c", program, "mesh", str(tmp_path / "a.nii.gz"), "-o", str(tmp_path / "a.vtu")]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "numba and other libraries need 1.2 GB; raise the limit (ulimit -v" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    done = subprocess.run([*words[:3], "--version"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
 
 
 # What is said meanwhile, where there is no terminal.

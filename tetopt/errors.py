@@ -4,9 +4,6 @@ import inspect
 import os
 import warnings
 
-# Options renamed before 0.1.0 whose old name resembles another option more.
-FORMER_NAMES = {"size_max": "edge_size"}
-
 
 class InputError(ValueError):
     """An invalid input that the user can fix: a file, an array or an option.

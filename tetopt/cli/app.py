@@ -19,9 +19,8 @@ from typer.core import TyperCommand, TyperGroup
 import tetopt
 from tetopt.cli.console import open_streams, print_line, say, settle_streams, show_error, show_event, warnings_once
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard, tell_end
-from tetopt.errors import FORMER_NAMES, InputError, error_words
+from tetopt.errors import InputError, error_words
 from tetopt.job.events import listened
-from tetopt.system.budget import check_addresses
 from tetopt.system.files import Outputs, outputs_of_command
 from tetopt.system.interpreter import THREADS_NAME
 
@@ -111,9 +110,6 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     except Exception as error:
         if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
             raise
-        former = FORMER_NAMES.get(getattr(error, "option_name", "").strip("-").replace("-", "_"))
-        if former is not None:
-            error.possibilities = ["--" + former.replace("_", "-")]  # type: ignore[attr-defined]
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
         return 2
@@ -170,9 +166,8 @@ def loaded_command(name: str) -> Callable[..., Any]:
     Raises
     ------
     InputError
-        There is no room for the libraries that it loads, or an environment variable of theirs has an invalid value.
+        An environment variable of the libraries that it loads has an invalid value.
     """
-    check_addresses()
     _check_environment()
     from tetopt.cli.options import from_records  # this import loads the modules of its defaults
 

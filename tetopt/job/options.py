@@ -24,7 +24,6 @@ from tetopt.engine.loop import (
     Boundary,
 )
 from tetopt.engine.paper import Retessellate
-from tetopt.errors import FORMER_NAMES
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
@@ -428,9 +427,7 @@ def has_model(options: SolverOptions) -> bool:
 
 def near_hint(name: str, names: Iterable[str]) -> str:
     """Return a suggestion for the end of a message if one of the names resembles the unknown one."""
-    plain = {each.strip("-").replace("-", "_"): each for each in names}
-    former = plain.get(FORMER_NAMES.get(name.strip("-").replace("-", "_"), ""))
-    near = [former] if former is not None else get_close_matches(name, plain.values(), 1)
+    near = get_close_matches(name, list(names), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 

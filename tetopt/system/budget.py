@@ -24,7 +24,6 @@ except ImportError:  # Windows
 
 BYTES_PER_GB = 1e9  # decimal, as for files
 MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss, see getrusage(2)
-LIBRARY_ADDRESSES = 1.2e9  # libraries, thread stacks and buffers, all kernels: 1.1 GB on two cores, 0.3 GB resident
 PROC_FOLDER = Path("/proc")
 GROUP_FOLDER = Path("/sys/fs/cgroup")
 UNLIMITED_BYTES = 1 << 60  # control groups write "no limit" as a number near 2^63
@@ -77,19 +76,6 @@ class MemoryLimit(NamedTuple):
     def is_reached(self) -> bool:
         """Return whether the run must end so as not to exceed the limit."""
         return resident_bytes() + self.next_bytes > self.n_bytes
-
-
-def check_addresses() -> None:
-    """Raise InputError if the process limit (`ulimit -v`) leaves too little address space to load numba and others.
-
-    Without address space, OpenBLAS and LLVM end the process, and other libraries fail to import.
-    """
-    room = address_room()
-    if room is not None and room < LIBRARY_ADDRESSES:
-        raise InputError(
-            f"the process limit leaves {memory_words(room)} of address space, but numba and other libraries need "
-            f"{memory_words(LIBRARY_ADDRESSES)}; raise the limit (ulimit -v, ulimit -d)"
-        )
 
 
 def available_bytes() -> int:
