@@ -66,7 +66,7 @@ def compare_command(
     report = compare_image(image_path, output, options, command, force=force)
     columns = [column for column in columns_of(report) if column.is_short]
     rows = rows_of(report, columns)
-    table = new_table("", *(f"{column.group.split(' ')[0]}:\n{column.heading}" for column in columns))
+    table = new_table("", *(column.heading.replace(" ", "\n") for column in columns))
     for row in rows:
         table.add_row(escape(row.title), *([text for text, _ in row.cells] or ["failed"]))
     print_table(table)
