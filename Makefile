@@ -103,10 +103,11 @@ test-solvers: $(VENV)/.test
 test-container: $(VENV)/.test
 	$(TESTED) -q -m "slow or not slow" --no-header tests/test_container.py
 
-# A SLURM of one node, started by hand in a folder of its own, runs six subjects; Debian's packages.
+# A SLURM of one node, started by hand in a folder of its own, runs the program and the job array of docs/howto/clusters.md.
 test-slurm: $(VENV)/.test
 	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install SLURM and munge, then run: TETOPT_SLURM=1 $(BIN)/python -m pytest tests/slurm"; exit 2; }
 	dpkg -s slurm-wlm munge >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends slurm-wlm munge; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check dask-jobqueue
 	TETOPT_SLURM=1 $(TESTED) -q -s --no-header tests/slurm
 
 # Two hundred subjects with failures put in, the client killed on the way: a quarter of an hour on two idle cores.

@@ -197,7 +197,7 @@ def ran(folder, program, cache=None, **names):
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, cwd=folder)
 
 
-WAITING = "import tetopt.cluster.tasks, numba; numba.set_num_threads(1); print(numba.threading_layer())"
+WAITING = "import tetopt.workers, numba; numba.set_num_threads(1); print(numba.threading_layer())"
 
 
 @pytest.mark.parametrize("chosen", [{}, {"OMP_WAIT_POLICY": "active"}])

@@ -18,14 +18,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tetopt import Image, InputError, load_phantom
-from tetopt.cluster.crew import Folders, Need
-from tetopt.cluster.tasks import Done, run_tasks
-from tetopt.cluster.workers import workers
 from tetopt.engine.loop import IterationRecord
 from tetopt.io.zarr_images import save_zarr
 from tetopt.parts.part import work_on
@@ -33,6 +30,7 @@ from tetopt.parts.rounds import PartsRequest, Round, Runner, mesh_in_parts
 from tetopt.parts.work import VolumeFile, save_volume
 from tetopt.system.budget import peak_bytes
 from tetopt.system.files import checked_output, save_json
+from tetopt.workers import Share, run_tasks, workers
 
 BOX_MM = 204.8
 N_BALLS = 400
@@ -131,10 +129,9 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
         if n_workers == 0:
             yield lambda names: _noted(map(_done, names), done)
             return
-        need = Need(n_parts, task_bytes, 1, is_within=True, most_bytes=worker_bytes)
         stage("workers begin")
-        with workers(need, Folders(folder, folder), count=n_workers, scheduler=None, cluster=None) as crowd:
-            yield lambda names: _noted(run_tasks(crowd, work_on, names), done)
+        with workers(Share(n_workers, 1, worker_bytes), None, 1) as pool:
+            yield lambda names: _noted(_results(run_tasks(pool, _done, names, str(folder), is_alone=True)), done)
             stage("the end")
 
     def watch(now: Round, history: list[IterationRecord]) -> None:
@@ -160,9 +157,26 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
     }  # fmt: skip
 
 
+class Done(NamedTuple):
+    """A part that is done, by which process, and what that had at its peak."""
+
+    name: str
+    result: Any
+    seconds: float
+    worker: int
+    peak_bytes: int
+
+
 def _done(name: str) -> Done:
     begin = time.perf_counter()
-    return Done(name, work_on(name), time.perf_counter() - begin, "this one", peak_bytes())
+    return Done(name, work_on(name), time.perf_counter() - begin, os.getpid(), peak_bytes())
+
+
+def _results(ended: Iterator[tuple[Any, Any, BaseException | None]]) -> Iterator[Done]:
+    for _, result, error in ended:
+        if error is not None:
+            raise error
+        yield result
 
 
 def _noted(tasks: Iterator[Done], done: list[Done]) -> Iterator[Done]:

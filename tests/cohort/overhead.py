@@ -8,11 +8,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from tetopt.cluster.crew import Folders, Need
-from tetopt.cluster.workers import workers
-from tetopt.cohort.run import Ended, SubjectTask
-from tetopt.cohort.schedule import run_all
+from tetopt.cohort.run import Ended, SubjectTask, run_all
 from tetopt.system.budget import resident_bytes
+from tetopt.workers import Share, workers
 
 
 def nothing(job: SubjectTask) -> Ended:
@@ -24,14 +22,12 @@ def main(n_subjects: int) -> None:
         folder = Path(name)
         words = ("--nodes=100000", "--iterations=20", "--", f"{folder}/a-usual-name-of-an-image_T1w.nii.gz")
         jobs = [SubjectTask(f"sub-{k:06d}", words, str(folder), ".vtu", 1, 1.0, "run-1") for k in range(n_subjects)]
-        with workers(Need(n_subjects, 1.0, 1), Folders(folder, folder), count=2, scheduler=None, cluster=None) as crew:
-            list(run_all(jobs[:100], crew.client, crew.slots, crew.bytes, task=nothing))  # what is imported once
+        with workers(Share(2, 1, 1e9), None, 1) as pool:
+            list(run_all(jobs[:100], pool, folder, nothing))  # what is imported once
             for part in range(1, 5):
                 before, begin = resident_bytes(), time.monotonic()
                 some = jobs[100 + (part - 1) * (n_subjects - 100) // 4 : 100 + part * (n_subjects - 100) // 4]
-                assert sum(
-                    ended.status == "done" for ended in run_all(some, crew.client, crew.slots, crew.bytes, task=nothing)
-                ) == len(some)
+                assert sum(ended.status == "done" for ended in run_all(some, pool, folder, nothing)) == len(some)
                 seconds = time.monotonic() - begin
                 print(
                     f"{len(some)} subjects: {1e3 * seconds / len(some):.1f} ms each, process of {before / 1e6:.1f} MB "

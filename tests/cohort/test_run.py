@@ -1,4 +1,4 @@
-"""One subject's run: whole or not at all, the same bytes as `tetopt mesh`, and why it failed."""
+"""Runs of subjects: whole or not at all, the same bytes as `tetopt mesh`, and why they failed."""
 
 import contextlib
 import json
@@ -15,8 +15,10 @@ import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
+from tetopt.cohort import run as run_module
 from tetopt.cohort.layout import begin, failure_path, log_path, numbers_path, subject_folder
-from tetopt.cohort.run import SubjectTask, _reason, run_subject
+from tetopt.cohort.run import Ended, SubjectTask, _reason, run_all, run_subject
+from tetopt.workers import Share, workers
 
 WORDS = ("--nodes=60", "--iterations=1", "--")
 
@@ -158,3 +160,48 @@ def test_a_run_that_is_given_up_ends(job, tmp_path):
     assert [each.name for each in (tmp_path / "out" / ".work").iterdir()] == ["tetopt-manifest"]
     assert not processes_of(job.out)
     assert not failure_path(tmp_path / "out", "sub-1").exists()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("n_bytes", "limit", "reason", "attempts"), [
+    (3e9, 2e9, "needs 3 GB of memory, but a worker has 2 GB; reduce the number of nodes", 0),
+    (0.0, 5e7, "exceeded its worker's memory limit of 50 MB; reduce the number of nodes, or use larger workers", 1),
+])  # fmt: skip
+def test_a_subject_beyond_its_workers_memory_is_a_row(job, tmp_path, monkeypatch, n_bytes, limit, reason, attempts):
+    """Not begun where that is predicted, and ended where it is measured."""
+    monkeypatch.setattr(run_module, "memory_limit", lambda: limit)
+    ended = run_subject(job._replace(n_bytes=n_bytes))
+    record = json.loads(failure_path(tmp_path / "out", "sub-1").read_text())
+    assert ended.status == "failed"
+    assert reason in ended.reason == record["reason"]
+    assert record["attempts"] == attempts
+    assert not [each for each in (tmp_path / "out" / ".work").iterdir() if each.is_dir()]
+    assert not processes_of(job.out)
+
+
+def of_four(job):
+    """One that fails, one that kills its workers, two that are done."""
+    if job.key == "sub-2":
+        raise ValueError("first\nlast\x1b[2J")
+    if job.key == "sub-3":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Ended(job.key, "done", "", 0.0, 0)
+
+
+@pytest.mark.full
+def test_of_a_cohort_one_fails_and_one_kills_its_workers_and_the_others_are_done(tmp_path, capfd):
+    out = tmp_path / "out"
+    begin(out)
+    jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, "run-1") for k in range(1, 5)]
+    with workers(Share(2, 1, 4e8), None, None) as pool:
+        ended = {each.key: each for each in run_all(jobs, pool, out, of_four)}
+    assert {key: each.status for key, each in ended.items()} == {
+        "sub-1": "done", "sub-2": "failed", "sub-3": "failed", "sub-4": "done"
+    }  # fmt: skip
+    records = [json.loads(failure_path(out, key).read_text()) for key in ("sub-2", "sub-3")]
+    assert [each["attempts"] for each in records] == [1, 2]
+    assert [each["reason"] for each in records] == [ended["sub-2"].reason, ended["sub-3"].reason]
+    assert ended["sub-2"].reason.startswith("ValueError: first last")
+    assert "\x1b" not in ended["sub-2"].reason
+    assert ended["sub-3"].reason == "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
+    assert capfd.readouterr() == ("", "")

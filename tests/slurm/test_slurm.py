@@ -11,17 +11,14 @@ import secrets
 import shutil
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 from commands import exit_code, numbers_in
 
-from tetopt.cluster.crew import Folders, Need
-from tetopt.cluster.workers import workers
-from tetopt.cohort.layout import begin, numbers_path
-from tetopt.cohort.run import Ended, SubjectTask
-from tetopt.cohort.schedule import run_all
+from tetopt.cohort.layout import numbers_path
 from tetopt.io.meshes import load_mesh
 
 pytestmark = [
@@ -57,13 +54,7 @@ KillWait=5
 NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={megabytes} State=UNKNOWN
 PartitionName=long Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
-YAML = """
-jobqueue:
-  slurm:
-    queue: long
-    cores: 1
-    walltime: "{walltime}"
-"""
+ROOT = Path(__file__).parents[2]
 
 
 def free_port():
@@ -139,61 +130,85 @@ def image(tmp_path_factory):
     return path
 
 
-def file_of(folder, walltime="00:10:00"):
-    path = folder / "cluster.yaml"
-    path.write_text(YAML.format(walltime=walltime))
-    return path
-
-
-def test_six_subjects(slurm, image, tmp_path):
-    """In two jobs; each asks for what a subject is predicted to need, a quarter more, and the worker's own."""
+@pytest.fixture
+def study(image, tmp_path):
+    """A table of six subjects, and what a run of each takes beside."""
     rows = [f"{k}\t{image}" for k in range(1, 7)]
     (tmp_path / "subjects.tsv").write_text("\n".join(["subject\timage", *rows, ""]))
-    out, before = tmp_path / "out", set(jobs_of_slurm())
-    words = ["--workers", 2, "--cluster", file_of(tmp_path), "--nodes", 500, "--iterations", 3]
-    assert exit_code("cohort", tmp_path / "subjects.tsv", "-o", out, *words) == 0
-    peak = max(numbers_in(numbers_path(out, f"sub-{k}"))["memory"]["peak_bytes"] for k in range(1, 7))
-    requested = {number: row for number, row in jobs_of_slurm().items() if number not in before}
-    assert len(requested) == 2
-    assert {(cores, time) for _, cores, _, time in requested.values()} == {(1, "00:10:00")}
-    (megabytes,) = {row[2] for row in requested.values()}
-    assert peak + 1.5e8 < megabytes * 2**20 < 2 * (peak + 1.5e8)
+    return tmp_path
+
+
+def code_of(language, *changes):
+    """The page's block of a language that names SLURM, with other words in place of some of its own."""
+    page = (ROOT / "docs" / "howto" / "clusters.md").read_text(encoding="utf-8")
+    (code,) = [each for each in re.findall(rf"```{language}\n(.*?)```", page, re.S) if "slurm" in each.lower()]
+    for old, new in changes:
+        assert code.count(old) == 1, old
+        code = code.replace(old, new)
+    return code
+
+
+def checked(out):
+    """All six are done."""
     for k in range(1, 7):
         path = numbers_path(out, f"sub-{k}")
-        numbers = numbers_in(path)
-        assert numbers["violated"] == {}
+        assert numbers_in(path)["violated"] == {}
         assert load_mesh(path.with_suffix(".vtu")).mesh.cells.shape[0] > 500
     assert (out / "cohort.html").is_file()
-    assert {path.name for path in (out / ".work").iterdir()} <= {"lock", "tetopt-manifest"}
-    # Nothing left to do, and so nothing is submitted.
-    assert exit_code("cohort", tmp_path / "subjects.tsv", "-o", out, *words) == 0
-    assert set(jobs_of_slurm()) == before | set(requested)
 
 
-def test_jobs_that_end_are_replaced(slurm, tmp_path):
-    """One is cancelled while its subject runs: the subject runs again, in a job that takes its place."""
+def test_the_program_of_the_page(slurm, study):
+    """Two jobs as workers; one is cancelled while its subject runs, which runs again, and a job takes its place."""
+    port = free_port()
+    program = code_of(
+        "python",
+        ('cores=4, processes=4, memory="16GB"', 'cores=1, processes=1, memory="2GB"'),
+        ('"port": 8786', f'"port": {port}'),
+        ("minimum_jobs=20, maximum_jobs=20", "minimum_jobs=2, maximum_jobs=2"),
+    )
+    (study / "scheduler.py").write_text(program)
+    before, out = set(jobs_of_slurm()), study / "out"
+    command = [sys.executable, "scheduler.py"]
+    with subprocess.Popen(command, cwd=study, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as scheduler:
+        try:
+            address = f"tcp://127.0.0.1:{port}"
+            assert f":{port}: press Enter" in scheduler.stdout.readline()
+            words = ["cohort", "subjects.tsv", "-o", out, "--nodes", 500, "--iterations", 3, "--scheduler", address]
+            with subprocess.Popen([sys.executable, "-m", "tetopt", *map(str, words)], cwd=study) as run:
+                (job, *_) = until(lambda: under_way(out) and set(jobs_of_slurm()) - before)
+                subprocess.run(["scancel", str(job)], check=True)
+                assert run.wait(600) == 0
+        finally:
+            scheduler.communicate("\n", timeout=60)
+    checked(out)
+    requested = {job: row for job, row in jobs_of_slurm().items() if job not in before}
+    assert len(requested) >= 3
+    assert {(cores, time) for _, cores, _, time in requested.values()} == {(1, "12:00:00")}
 
-    def cancelled_once(job):  # in here, so that it is sent as it is: jobs cannot import this module
-        mark = Path(job.out) / "cancelled"
-        if job.key == "sub-2" and not mark.exists():
-            mark.touch()
-            subprocess.run(["scancel", os.environ["SLURM_JOB_ID"]], check=True)
-            time.sleep(60)
-        return Ended(job.key, "done", os.environ["SLURM_JOB_ID"], 0.0, 0)
 
-    out = tmp_path / "out"
-    begin(out)
-    jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, "run-1") for k in range(1, 5)]
-    before = set(jobs_of_slurm())
-    folders = Folders(out / ".work", out / "logs")
-    with workers(Need(4, 1.0, None), folders, count=1, scheduler=None, cluster=file_of(tmp_path)) as crew:
-        ended = list(run_all(jobs, crew.client, crew.slots, crew.bytes, task=cancelled_once))
-        after = {number: row for number, row in jobs_of_slurm().items() if number not in before}
-    assert sorted((each.key, each.status) for each in ended) == [(f"sub-{k}", "done") for k in range(1, 5)]
-    assert [row[0] for _, row in sorted(after.items())] == ["CANCELLED", "RUNNING"]
-    # Told of by dask, and so counted: a subject that outlasts its job's wall time is not begun for ever.
-    assert "sub-2-run-1-1 marked as failed because 1 workers died" in (folders.logs / "dask.log").read_text()
-    first, second = sorted(after)
-    assert {each.key: int(each.reason) for each in ended} == {
-        "sub-1": first, "sub-2": second, "sub-3": second, "sub-4": second
-    }  # fmt: skip
+def under_way(out):
+    """Two subjects run, one in each job."""
+    return len(list((out / ".work").glob("sub-*.run-*"))) == 2
+
+
+def until(condition):
+    end = time.monotonic() + 300
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    return found
+
+
+def test_the_job_array_of_the_page(slurm, study):
+    """Six jobs into one folder, a subject each."""
+    script = code_of(
+        "bash", ("1-50", "1-6"), ("--cpus-per-task=4 --mem=8G", "--cpus-per-task=1 --mem=1G"),
+        ("--nodes 20000", "--nodes 500 --iterations 3"), ("--threads 4", "--threads 1"),
+    )  # fmt: skip
+    assert script.count("tetopt cohort") == 1
+    (study / "array.sh").write_text(script)
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    subprocess.run(["sbatch", "--wait", "array.sh"], cwd=study, env=environment, check=True, timeout=600)
+    words = [study / "subjects.tsv", "-o", study / "OUT", "--collect"]
+    assert exit_code("cohort", *words) == 0, "\n".join(path.read_text() for path in study.glob("slurm-*.out"))
+    checked(study / "OUT")

@@ -14,15 +14,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.cli.console import log, print_line, show_error, show_event
-from tetopt.cluster.crew import counted
-from tetopt.cluster.workers import local_share
 from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned
-from tetopt.cohort.estimate import need_of
+from tetopt.cohort.estimate import share_for
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
+from tetopt.io.text import counted
 from tetopt.job.events import Event, listened, time_words
 from tetopt.job.options import Option, RunOptions
 from tetopt.system.budget import memory_words
@@ -36,7 +35,7 @@ def cohort_command(
     cohort: CohortOptions,
     options: RunOptions,
 ) -> int:
-    """Mesh many subjects from a table or a BIDS folder, on this machine or a cluster; resume an interrupted run."""
+    """Mesh many subjects from a table or a BIDS folder, here or on a dask cluster; resume an interrupted run."""
     try:
         plan = plan_cohort(subjects, cohort, options)
     except Problems as problems:
@@ -68,8 +67,8 @@ def _say_estimate(plan: CohortPlan) -> None:
         print_line("nothing to run")
         return
     whole = f"{counted(len(to_run), 'subject')}, at most {memory_words(max(estimate.values(), default=0.0))} each"
-    if cohort.cluster is None and cohort.scheduler is None:
-        n_workers = local_share(need_of(len(to_run), estimate, cohort, plan.threads), cohort.workers).workers
+    if cohort.scheduler is None:
+        n_workers = share_for(len(to_run), estimate, cohort, plan.threads).workers
         whole += f"; {n_workers} at a time on this machine"
     print_line(whole)
 

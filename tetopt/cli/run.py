@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
-from tetopt.cluster.crew import counted
 from tetopt.engine.loop import IterationRecord
+from tetopt.io.text import counted
 from tetopt.job.events import Event, Stage
 from tetopt.job.in_parts import PartsProgress
 from tetopt.job.meshing import left_words

@@ -9,12 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cluster.crew import counted
-from tetopt.cluster.tasks import SchedulerLost
-from tetopt.cluster.workers import Folders, check_choice, workers
-from tetopt.cohort.estimate import Estimate, estimated, need_of
+from tetopt.cohort.estimate import Estimate, estimated, share_for
 from tetopt.cohort.layout import (
-    LOGS_NAME,
     WORK_NAME,
     begin,
     check_out,
@@ -35,15 +31,16 @@ from tetopt.cohort.plan import (
     with_places,
     with_states,
 )
-from tetopt.cohort.run import Ended, SubjectTask
-from tetopt.cohort.schedule import run_all
+from tetopt.cohort.run import Ended, SubjectTask, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.errors import InputError
+from tetopt.io.text import counted
 from tetopt.job.events import Listener, listened, note, progress, started, violated, warning
 from tetopt.job.job import in_kinds
 from tetopt.job.options import RunOptions, kinds_of, near_hint
 from tetopt.system.budget import memory_words
 from tetopt.system.files import checked_output
+from tetopt.workers import SchedulerLost, check_workers, workers
 
 NAMED_FAILURES = 20  # reasons printed: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run next to others in the folder, with a lock each: a process may open 1024 files
@@ -95,7 +92,7 @@ def run_cohort(
     **options
         For all subjects, those of a `Job` except images, outputs and parts; for the cohort: `suffix`, `participants`,
         `sessions`, `mesh_format`, `write_table`, `dry_run`, `retry_failed`, `collect`, `workers`,
-        `scheduler`, `cluster`.
+        `scheduler`.
 
     Returns
     -------
@@ -147,7 +144,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     InputError
         Options are invalid; `Problems` lists all problems of the subjects.
     """
-    check_choice(cohort.workers, cohort.scheduler, cohort.cluster, "cohort")
+    check_workers(cohort.workers, cohort.scheduler, "cohort")
     suffix = checked_suffix(cohort.mesh_format)
     place = cohort.output
     if options.threads is not None and options.threads < 1:
@@ -225,21 +222,15 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
     work = place / WORK_NAME
     alive = work / f"run-{secrets.token_hex(4)}"
     alive.touch()
-    need = need_of(len(to_run), estimate, cohort, plan.threads)
+    share = share_for(len(to_run), estimate, cohort, plan.threads)
     try:
-        with workers(
-            need,
-            Folders(work, place / LOGS_NAME),
-            count=cohort.workers,
-            scheduler=cohort.scheduler,
-            cluster=cohort.cluster,
-        ) as pool:
-            note(pool.words)
+        with workers(share, cohort.scheduler, plan.threads) as pool:
+            note(pool.words())
             jobs = [_job(entry, estimate, place, plan.suffix, pool.threads, alive.name) for entry in to_run]
             jobs.sort(key=lambda job: -job.n_bytes)  # so that no large run remains alone at the end
             refresh, tell = _refresher(place), _teller(jobs, pool.slots())
             try:
-                for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
+                for ended in run_all(jobs, pool, alive):
                     tell(ended)
                     refresh()
             finally:  # before the workers close, which then abandon their runs

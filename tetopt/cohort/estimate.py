@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import fields
 from io import StringIO
 
-from tetopt.cluster.workers import Need
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.plan import PlannedSubject
 from tetopt.engine.meshing import process_bytes
@@ -19,7 +18,9 @@ from tetopt.job.options import SizeOptions
 from tetopt.job.plan import expected_nodes
 from tetopt.job.read import read_planned
 from tetopt.system.budget import available_bytes
+from tetopt.workers import MEMORY_MARGIN, Share, share_of
 
+WORKER_BYTES = 1.5e8  # of a dask worker with its nanny: 65 MB each, and their messages
 LIKE_READS = 8  # subjects of a kind that are read for sizes not in headers: half a minute for large ones
 
 
@@ -63,10 +64,8 @@ def _read_bytes(entry: PlannedSubject) -> float | None:
     return process_bytes(task.source.content, expected_nodes(task.plan, task.source.content))
 
 
-def need_of(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
-    """Return the need of workers; on this machine, without tasks larger than its memory, which will not begin."""
-    sizes = list(estimate.values())
-    if cohort.scheduler is None and cohort.cluster is None:
-        free = available_bytes()
-        sizes = [each for each in sizes if each <= free]
-    return Need(n_tasks, max(sizes, default=0.0), threads)
+def share_for(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Share:
+    """Divide this machine among subjects; those larger than its memory will not begin."""
+    free = available_bytes()
+    largest = max((each for each in estimate.values() if each <= free), default=0.0)
+    return share_of(n_tasks, MEMORY_MARGIN * largest + WORKER_BYTES, cohort.workers, threads)

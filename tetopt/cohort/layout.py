@@ -33,12 +33,12 @@ TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
 OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write to OUT
 BIDS_VERSION = "1.10.0"  # of the specification that names follow
 KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
-# A subject's former outputs, with users' own files, before new ones replace them; its unfinished outputs; dask's files.
+# A subject's former outputs, with users' own files, before new ones replace them; its unfinished outputs.
 # None of these is opened, only moved or removed.
 WORK = Layout(
     "cohort",
-    rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock|run-\w+|seen-\d+",
-    {rf"{KEY_PATTERN.pattern}\.before": None, rf"{KEY_PATTERN.pattern}\.run-\w+\.\d+": None, "dask": None},
+    rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock|run-\w+",
+    {rf"{KEY_PATTERN.pattern}\.before": None, rf"{KEY_PATTERN.pattern}\.run-\w+\.\d+": None},
 )
 
 
@@ -189,7 +189,7 @@ def restore(out: Path, keys: list[str] | None = None) -> None:
                 continue
             if name.endswith(".before"):
                 _put_back(out / WORK_NAME / name, out, name.removesuffix(".before"))
-            # Removing their files (run-..., seen-...) ends what a cluster still does for killed runs.
+            # Removing their files (run-...) ends what a cluster still does for killed runs.
             if stat.S_ISDIR(mode) or (keys is None and name != MANIFEST_NAME and not name.endswith(LOCK_NAME)):
                 work.remove(name, mode)
 

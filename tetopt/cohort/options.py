@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from tetopt.io.formats import FORMATS
-from tetopt.job.options import ClusterOption, Option, SchedulerOption
+from tetopt.job.options import Option, SchedulerOption, WorkersOption
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,5 @@ class CohortOptions:
     dry_run: Annotated[bool, Option(None, "Show subjects to run, with reasons and cost; run nothing.")] = False
     retry_failed: Annotated[bool, Option(None, "Run only failed subjects; skip out-of-date ones.")] = False
     collect: Annotated[bool, Option(None, "Write the table and page of existing results; run nothing.")] = False
-    workers: Annotated[
-        int | None, Option("N", "Maximum number of simultaneous subjects, or of a `cluster`'s jobs.", least=1)
-    ] = None
+    workers: WorkersOption = None
     scheduler: SchedulerOption = None
-    cluster: ClusterOption = None

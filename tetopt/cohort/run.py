@@ -1,6 +1,6 @@
 """One subject: meshed by its own process, whose outputs are published together, or whose failure is recorded.
 
-A worker runs it. It exchanges only names and numbers; data are in files.
+A worker of dask runs it. It exchanges only names and numbers; data are in files.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 import shlex
 import shutil
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,14 +23,18 @@ from tetopt.cohort.layout import (
     publish,
     subject_folder,
 )
+from tetopt.errors import InputError
 from tetopt.io.text import last_line
-from tetopt.system.budget import peak_bytes
+from tetopt.system.budget import memory_words, peak_bytes
 from tetopt.system.child import signal_words, started, watched
 from tetopt.system.files import save_json, save_text
 from tetopt.system.interpreter import python_command, python_environment
+from tetopt.workers import WorkerEnded, Workers, memory_limit, run_tasks
 
 LOOK_SECONDS = 0.2  # between two checks of a run: a hundredth of the shortest expected run
 MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find enough memory
+GIVEN_UP, TOO_LARGE = "given up", "exceeded its worker's memory limit"
+LARGER_WORKERS = "reduce the number of nodes, or use larger workers"
 ERROR_MARK = "tetopt: "  # prefix of a line that states why a run failed
 WARNING_MARK = "tetopt: warning: "
 THREAD_NAMES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -57,11 +62,33 @@ class Ended(NamedTuple):
     peak_bytes: int  # of resident memory
 
 
+def run_all(
+    jobs: Sequence[SubjectTask], pool: Workers, mark: Path, task: Callable[[SubjectTask], Ended] | None = None
+) -> Iterator[Ended]:
+    """Run subjects on workers, which all must find the file `mark`; yield outcomes as they come.
+
+    `task` is `run_subject`, or another function that can be pickled.
+    """
+    for job, ended, error in run_tasks(pool, task or run_subject, jobs, str(mark)):
+        if error is None:
+            yield ended
+            continue
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        failed = Ended(job.key, "failed", last_line(kind + " ".join(str(error).split())), 0.0, 0)
+        set_down(Path(job.out), job, failed, error.times if isinstance(error, WorkerEnded) else 1)
+        yield failed
+
+
 def run_subject(job: SubjectTask) -> Ended:
-    """Mesh a subject; a run that a signal ends is repeated once."""
-    begin = time.monotonic()
+    """Mesh a subject; a run that a signal ends is repeated once, unless its worker has too little memory."""
+    begin, limit = time.monotonic(), memory_limit()
+    if job.n_bytes > limit:
+        reason = f"needs {memory_words(job.n_bytes)} of memory, but a worker has {memory_words(limit)}"
+        ended = Ended(job.key, "failed", f"{reason}; {LARGER_WORKERS}", 0.0, 0)
+        set_down(Path(job.out), job, ended, 0)
+        return ended
     for attempt in range(1, MOST_ATTEMPTS + 1):
-        ended, is_crash = _attempt(job, begin, attempt)
+        ended, is_crash = _attempt(job, begin, attempt, limit)
         if not is_crash:
             break
     if ended.status == "failed":
@@ -85,7 +112,7 @@ def set_down(out: Path, job: SubjectTask, ended: Ended, attempts: int) -> None:
     )
 
 
-def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]:
+def _attempt(job: SubjectTask, begin: float, attempt: int, limit: float) -> tuple[Ended, bool]:
     """Run once; return the outcome, and whether a foreign signal ended it."""
     out = Path(job.out)
     work = out / WORK_NAME / f"{job.key}.{job.run}.{os.getpid()}"
@@ -102,11 +129,17 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
         log.open("ab") as stream,
         started(command, environment, work, stdout=stream, stderr=stream) as child,
     ):
-        peak, given_up = watched(child, LOOK_SECONDS, peak_bytes, lambda _: None if run.exists() else "given up")
+        peak, ending = watched(
+            child, LOOK_SECONDS, peak_bytes,
+            lambda peak: GIVEN_UP if not run.exists() else TOO_LARGE if peak > limit else None,
+        )  # fmt: skip
     seconds = time.monotonic() - begin
-    if given_up is not None:
+    if ending is not None:
         shutil.rmtree(work, ignore_errors=True)
-        return Ended(job.key, "given up", "given up", seconds, peak), False
+        if ending == GIVEN_UP:
+            return Ended(job.key, "given up", GIVEN_UP, seconds, peak), False
+        reason = f"{TOO_LARGE} of {memory_words(limit)}; {LARGER_WORKERS}"
+        return Ended(job.key, "failed", reason, seconds, peak), False
     numbers = numbers_of(mesh.with_suffix(".json"))
     if child.returncode in (0, 1) and numbers is not None and mesh.is_file():
         publish(work, out, job.key)

@@ -51,6 +51,11 @@ def plain(text: str) -> str:
     )
 
 
+def counted(number: int, noun: str) -> str:
+    """Format a number of things."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def _escaped(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
+import functools
 import hashlib
 import json
 import time
@@ -12,12 +14,10 @@ from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 import tetopt
-from tetopt.cluster.crew import Folders, Need, Workers, counted
-from tetopt.cluster.tasks import run_tasks
-from tetopt.cluster.workers import check_choice, local_share, workers
 from tetopt.contents.content import Content
 from tetopt.contents.statistics import statistics
 from tetopt.engine.fast import prepare_kernels
@@ -28,6 +28,7 @@ from tetopt.image import Image
 from tetopt.io.images import file_shape, parse_crop
 from tetopt.io.label_tables import NO_TABLE
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored
+from tetopt.io.text import counted, plain
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, warning
 from tetopt.job.options import DEFAULT_NODES, JobOptions, PartsOptions, stated_part
 from tetopt.job.plan import Plan
@@ -40,11 +41,15 @@ from tetopt.model.sets import box_of, box_text
 from tetopt.parts.division import Division, work_folder
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, mesh_in_parts
-from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, identity, removed
+from tetopt.parts.work import STATE_NAME, VOLUME_NAME, VolumeFile, identity, removed
 from tetopt.system.budget import BYTES_PER_GB, available_bytes, memory_words
+from tetopt.workers import MEMORY_MARGIN, WorkerEnded, check_workers, run_tasks, share_of, workers
 
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole, with all features of a run in one piece
 MOST_DRAWN = 2**27  # voxels of the image level that is drawn
+OWN_BYTES = 4e8  # of a worker: 240 MB with all kernels loaded, its nanny, zarr and buffers of threads
+TERMINATE_FRACTION = 0.95  # of a worker's memory limit, where dask ends it
+MORE_MEMORY = "give workers more memory, or increase `parts`"
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 # Options that need all cells or voxels at once, and the values, other than none, that parts accept.
 PARTS_TAKE: dict[str, Any] = {
@@ -78,11 +83,9 @@ def with_parts(plan: Plan) -> Plan:
         raise InputError(unsupported)
     if job.worker_gb is not None and not job.worker_gb > 0.0:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
-    if job.worker_gb is not None and (job.scheduler or job.cluster):
-        raise InputError(
-            "`worker_gb`: only for workers on this machine; those of `scheduler` and `cluster` have their own limits"
-        )
-    check_choice(job.workers, job.scheduler, job.cluster, "blocks")
+    if job.worker_gb is not None and job.scheduler is not None:
+        raise InputError("`worker_gb`: only for workers on this machine; those of `scheduler` have their own limits")
+    check_workers(job.workers, job.scheduler, "blocks")
     file = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
     return plan._replace(division=Division(job.parts or 1), left=file if _is_left(plan) else None)
 
@@ -190,12 +193,8 @@ def run_in_parts(
         started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
         started("parts", "optimising in parts")
-        with _team(task.plan.job, folder, n_parts, n_bytes) as team:
-
-            def run(names: Sequence[str]) -> Iterator[Any]:
-                return run_tasks(team, work_on, [str(Path(name).absolute()) for name in names], is_over=is_over)
-
-            yield run
+        with _runner(task.plan.job, folder, n_parts, n_bytes) as runner:
+            yield runner
 
     started("parts", "optimising in parts")
     try:
@@ -219,30 +218,52 @@ def run_in_parts(
     return parted, task_bytes
 
 
+def worker_bytes(part_bytes: float) -> float:
+    """Return the memory of a worker with a part of this size."""
+    return (part_bytes + OWN_BYTES) / TERMINATE_FRACTION
+
+
 @contextlib.contextmanager
-def _team(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iterator[Workers]:
+def _runner(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iterator[Runner]:
     """Start the workers of a job for this number of parts and bytes; raise InputError for too little memory."""
-    most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
-    need = Need(n_parts, n_bytes, job.threads, is_within=True, most_bytes=most)
-    here = folder.absolute()  # workers started elsewhere have other current folders
-    folders = Folders(here, here / LOGS_NAME)
-    folders.logs.mkdir(exist_ok=True)
-    if job.scheduler is None and job.cluster is None:
-        _check_room(need, local_share(need, job.workers).bytes)  # a worker with too little does not even start
-    with workers(need, folders, count=job.workers, scheduler=job.scheduler, cluster=job.cluster) as team:
-        note(team.words)
-        _check_room(need, team.bytes)
-        yield team
-
-
-def _check_room(need: Need, room: float) -> None:
-    """Raise InputError if a part needs more memory than its worker has."""
-    if need.task_bytes > room:
+    most = float("inf") if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
+    share = share_of(n_parts, worker_bytes(MEMORY_MARGIN * n_bytes), job.workers, job.threads, most)
+    if job.scheduler is None and share.bytes < worker_bytes(n_bytes):
         raise InputError(
-            f"a part needs about {memory_words(need.task_bytes)} of memory, and its worker "
-            f"{memory_words(need.limit_for(need.task_bytes))} in total, more than available; increase `parts`, reduce "
+            f"a part needs about {memory_words(n_bytes)} of memory, and its worker "
+            f"{memory_words(worker_bytes(n_bytes))} in total, more than available; increase `parts`, reduce "
             "`workers`, or give them more memory"
         )
+    with workers(share, job.scheduler, job.threads) as pool:
+        note(pool.words())
+
+        def run(names: Sequence[str]) -> Iterator[Any]:
+            places = [str(Path(name).absolute()) for name in names]  # workers elsewhere have other current folders
+            task = functools.partial(_worked_on, pool.threads)
+            for name, numbers, error in run_tasks(
+                pool, task, places, str((folder / VOLUME_NAME).absolute()), is_alone=True
+            ):
+                if isinstance(error, WorkerEnded):
+                    raise InputError(f"{plain(name)}: {error}; {MORE_MEMORY}")
+                if error is not None:
+                    raise error
+                yield numbers
+
+        yield run
+
+
+def _worked_on(threads: int, name: str) -> Any:
+    """Work on a part in a worker, with this number of threads."""
+    numba.config.reload_config()  # the main program may have loaded numba before dask set the environment
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    try:
+        return work_on(name)
+    except MemoryError as error:
+        raise InputError(f"{plain(name)}: an allocation failed ({plain(str(error))}); {MORE_MEMORY}") from error
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise InputError(f"{plain(str(error))}; free some space, and run this again") from error
 
 
 def _request(task: Task) -> PartsRequest:

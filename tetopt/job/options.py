@@ -297,14 +297,9 @@ class EngineOptions:
     )
 
 
-WorkersOption = Annotated[
-    int | None, Option("N", "Maximum number of simultaneous tasks, or of jobs, with `cluster`.", least=1)
-]
+WorkersOption = Annotated[int | None, Option("N", "Maximum number of simultaneous tasks on this machine.", least=1)]
 SchedulerOption = Annotated[
     str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
-]
-ClusterOption = Annotated[
-    Path | None, Option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), configured as for dask-jobqueue.")
 ]
 
 
@@ -320,7 +315,6 @@ class PartsOptions:
     workers: WorkersOption = None
     worker_gb: Annotated[float | None, Option("GB", "Memory limit of each worker on this machine.")] = None
     scheduler: SchedulerOption = None
-    cluster: ClusterOption = None
 
 
 @dataclass(frozen=True, kw_only=True)

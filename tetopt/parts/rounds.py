@@ -283,7 +283,9 @@ def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]
 
 def _prepared(run: _Run, state: WorkState, parts: list[Piece], kind: Kind) -> list[Path]:
     """Write the input files of the parts and return their paths, in order."""
-    folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
+    number = state.n_rounds
+    # Workers may still write parts of an interrupted round.
+    folder = round_folder(run.folder, number + (kind == "fields"))
     folder.mkdir(exist_ok=True)
     n_nodes = 1 + max(int(piece.nodes[-1]) for piece in parts)
     first = (number - 1) * ROUND_SWEEPS + 1

@@ -5,7 +5,6 @@ state.json                    the request, and the state after the last complete
 mesh-R.npz                    the mesh after round R, only of the last round
 round-R/part-P.npz            the input of a part of the next round
 round-R/done-P.npz            its result
-logs/                         output of dask and of a batch system's jobs
 
 `tetopt.system.work_directory` rejects all other entries.
 """
@@ -38,11 +37,10 @@ from tetopt.system.incoming import json_of, own_bytes
 from tetopt.system.work_directory import LOCK_NAME, Layout, create, discard
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
-LOGS_NAME = "logs"
 LAYOUT = Layout(
     "a mesh in parts",
-    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz|seen-\d+",
-    {r"round-\d+": r"(part|done)-\d+\.npz", LOGS_NAME: ".+", "dask": None},
+    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz",
+    {r"round-\d+": r"(part|done)-\d+\.npz"},
 )
 TEXT_NAME = "text"  # entry of a file of arrays with further information, in JSON
 

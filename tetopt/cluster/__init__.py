@@ -1,1 +1,0 @@
-"""Dask workers, here or on a cluster, and their tasks."""
