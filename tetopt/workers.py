@@ -182,7 +182,7 @@ def run_tasks(
         The scheduler is gone.
     """
     task = partial(_run, _versions(), mark, is_alone, function)
-    waiting, running = list(reversed(names)), {}
+    waiting, running = list(reversed(names)), dict[Any, Any]()
     try:
         while waiting or running:
             for _ in range(min(len(waiting), pool.slots() - len(running)) if waiting else 0):
