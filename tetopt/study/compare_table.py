@@ -36,7 +36,7 @@ class Column(NamedTuple):
         return self.title + ARROWS[self.better]
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """A mesh: its numbers, or its failure."""
 
     title: str
@@ -134,7 +134,7 @@ def _error(report: Report, nu: str, name: str) -> Value:
     return value
 
 
-def rows_of(report: Report, columns: list[Column]) -> list[Row]:
+def rows_of(report: Report, columns: list[Column]) -> list[TableRow]:
     """Return a row for each pipeline's mesh of linear cells, and then of quadratic ones."""
     return [
         _row(each, each.title if order == 1 else f"{each.title}, {ORDER_WORDS[order]}", columns)
@@ -143,10 +143,10 @@ def rows_of(report: Report, columns: list[Column]) -> list[Row]:
     ]
 
 
-def _row(pipeline: PipelineResult, title: str, columns: list[Column]) -> Row:
+def _row(pipeline: PipelineResult, title: str, columns: list[Column]) -> TableRow:
     if pipeline.median is None:
-        return Row(title, pipeline.kind, pipeline.failure, [])
-    return Row(title, pipeline.kind, None, [_cell(pipeline, column.value) for column in columns])
+        return TableRow(title, pipeline.kind, pipeline.failure, [])
+    return TableRow(title, pipeline.kind, None, [_cell(pipeline, column.value) for column in columns])
 
 
 def _cell(pipeline: PipelineResult, value: Value) -> tuple[str, str]:
