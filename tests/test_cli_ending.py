@@ -65,7 +65,7 @@ def signals_not_ignored():
 @pytest.mark.parametrize("number", LATE_SIGNALS)
 def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, signals_not_ignored, number):
     @contextmanager
-    def told(_):
+    def told(*_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
 
     monkeypatch.setattr(tetopt.cli.run, "_bar", told)
