@@ -203,6 +203,7 @@ def test_unexplained_is_what_cells_leave_of_the_variance_of_their_voxels():
     assert unexplained(content(Image(np.ones((6, 5, 4)))), mesh) is None
 
 
+@kernel
 def test_unexplained_of_two_equal_contrasts_is_that_of_one():
     image, mesh = part_of_noise()
     one = unexplained(content(image), mesh)

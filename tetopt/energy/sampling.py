@@ -657,7 +657,7 @@ def triangle_flux(
     error = 1e-9 + 4e-15 * scale * size
     margin = 0.5 - error if error < 0.25 else -1.0
     lowest, highest = min(a[2], b[2], c[2]) >> bits, -((-max(a[2], b[2], c[2])) >> bits)
-    zero = 0 * prefix[0, 0, 0, 0]  # an integer for integer sums
+    zero = np.int64(0) * prefix[0, 0, 0, 0]  # of 64 bits for integer sums, in plain Python, too
     count, sum_1, sum_2 = 0, zero, zero
     more = (zero, zero, zero, zero, zero, zero)
     long0, long1 = c[0] - a[0], c[1] - a[1]
