@@ -183,9 +183,9 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
     if len(mins) == len(maxs) == len(spacings) == len(sizes):
         steps = [(maxs - mins) / np.maximum(np.array(sizes) - k, 1) for k in (0, 1)]  # of cells, of nodes
         if not any(_is_alike(each, spacings) for each in steps):
-            words = f"{sizes_words(spacings)}, but {sizes_words(steps[0])} by its axis mins and maxs"
-            words = f"its spacings are {words}" if n_unknown == 0 else f"its spacings are taken as {words}"
-            notes.append(f"{words}; the spacings are used, check them")
+            words = f"{'are' if n_unknown == 0 else 'are taken as'} {sizes_words(spacings)}"
+            words += f", but {sizes_words(steps[0])} by its axis mins and maxs; the spacings are used, check them"
+            notes.append(f"its spacings {words}")
     notes.append("it has no space, which leaves left and right open: assuming left-posterior-superior, as ITK does")
     return notes
 

@@ -714,12 +714,17 @@ def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds |
         _check_in_crop(bounds, axis, index)
         bounds[axis] = (index, index + 1)
     check_room([stop - start for start, stop in bounds], image.voxels.dtype.itemsize)
-    voxels = image.voxels.within(bounds)
-    check_chunks(voxels, notes)
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([start for start, _ in bounds])
-    part = Image(read_chunks(voxels), affine)
+    in_file = cropped_in_file(image, bounds)
+    check_chunks(in_file.voxels, notes)
+    part = Image(read_chunks(in_file.voxels), in_file.affine)
     return part if slice_ is None else image_slice(part, slice_[0], 0)
+
+
+def cropped_in_file(image: Image, ranges: list[tuple[int, int]]) -> Image:
+    """Return the part of a stored image in a box of indices, start to stop; its voxels stay in their file."""
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
+    return Image.stored(image.voxels.within(ranges), affine)
 
 
 def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:

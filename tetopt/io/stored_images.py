@@ -17,6 +17,7 @@ from tetopt.io.images import (
     Bounds,
     check_beginning,
     checked_bounds,
+    cropped_in_file,
     folder_checksum,
     image_files,
     named_error,
@@ -82,7 +83,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     try:
         image = _opened(path, volume, notes)
         if crop is not None:
-            image = _cropped(image, checked_bounds(image.shape, crop))
+            image = cropped_in_file(image, checked_bounds(image.shape, crop))
         if image.voxels.chunks is not None:
             check_chunks(image.voxels, notes)
     except InputError as error:
@@ -163,12 +164,6 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
     if name.endswith(_PACKED_SUFFIXES):
         raise InputError("a compressed file cannot be read in parts; unpack it or convert it to .zarr first")
     raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
-
-
-def _cropped(image: Image, ranges: list[tuple[int, int]]) -> Image:
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return Image.stored(image.voxels.within(ranges), affine)
 
 
 class _Scaled:
