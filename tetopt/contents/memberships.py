@@ -253,7 +253,7 @@ def _level(
         smooth = _flowed(level, FINE_SIGMA)
         if fraction.any():
             smooth += fraction * (_flowed(level, BROAD_SIGMA) - smooth)
-        level = with_volume(smooth, raw, max(VOLUME_SIGMA, *factors), (low, high))
+        level = _with_volume(smooth, raw, max(VOLUME_SIGMA, *factors), low, high)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 
 
@@ -320,12 +320,12 @@ def _correlated_rows(data: NDArray, weights: NDArray) -> NDArray:
     return result
 
 
-def with_volume(
-    level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, bounds: tuple[NDArray, NDArray] | None = None
+def _with_volume(
+    level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, low: NDArray, high: NDArray
 ) -> NDArray[np.float32]:
     """Raise or lower the level smoothly, so that it has the label's volume within `sigma`.
 
-    It stays within lower and upper `bounds`, if given. Both passes over the voxels are kernels, which take a third of
+    It stays between the levels `low` and `high`. Both passes over the voxels are kernels, which take a third of
     numpy's time.
     """
     mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, with the level linear between centres
@@ -335,7 +335,6 @@ def with_volume(
     _fill_block_sums(missing, area, level.reshape(whole), mean.reshape(whole), raw.reshape(whole))
     missing, area = (_blurred(sums.reshape(sums.shape[3 - level.ndim :]), sigma) for sums in (missing, area))
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), np.float32(0.0))
-    low, high = bounds or (np.full_like(level, -np.inf), np.full_like(level, np.inf))
     result = np.empty(whole, dtype=np.float32)
     _fill_lowered(result, level.reshape(whole), lowered.reshape(blocks), low.reshape(whole), high.reshape(whole))
     return result.reshape(level.shape)
