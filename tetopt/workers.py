@@ -137,7 +137,7 @@ def workers(share: Share, scheduler: str | None, threads: int | None) -> Iterato
             dashboard_address="127.0.0.1:0",
             env={THREADS_NAME: str(share.threads)},
             silence_logs=logging.CRITICAL,
-            security=find_spec("cryptography") is not None,  # keeps other users of this machine out
+            security=find_spec("cryptography") is not None or None,  # keeps other users of this machine out; not False
         ) as cluster,
         Client(cluster) as client,
     ):
