@@ -68,19 +68,6 @@ def test_a_label_that_few_have():
     assert [flag.words for flag in flags[3]] == ["label 99 in its image: 1 of 20 have it"]
 
 
-def test_the_same_image_twice_is_told_of_both():
-    rng = np.random.default_rng(4)
-    rows = [row_of(k, run_of(rng)) for k in range(4)]
-    for k in (1, 3):
-        rows[k].numbers["image_sha256"] = "same"
-    flags = flags_of(rows)
-    assert [[flag.words for flag in each] for each in flags] == [
-        [], ["the same image as sub-3"], [], ["the same image as sub-1"]
-    ]  # fmt: skip
-    rows[3].numbers["options.volume"] = 2  # another one of a file of several
-    assert flags_of(rows) == [[], [], [], []]
-
-
 def test_no_majority_no_odd_one():
     rng = np.random.default_rng(4)
     runs = [run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])) for sign in (1.0, 1.0, 1.0, -1.0, -1.0)]

@@ -19,14 +19,6 @@ FEW_SUBJECTS = 8  # with fewer, numbers are not judged; also the 8 above
 MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
 MAJORITY_FRACTION = 2 / 3  # of subjects that agree: with fewer there is no common value
 COMMON_FRACTION = 0.9  # of subjects that have what others lack: with fewer it is a choice
-LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of equal size and position differ this much
-# Excess of correlations with the others' flipped pictures: within 0.001 for a symmetric head that is meshed again, and
-# 0.01 (whole heads) to 0.12 (brains) with back and front exchanged.
-TURN_MARGIN = 0.005
-# A flipped picture is about as far on the other side of 0 as the others' median; a cropped one at a fifth of that.
-TURN_FRACTION = 1 / 3
-SIDED_DEVIATIONS = 1.5  # by which the others' median is below 0: true for at least 9 of 10 normal numbers
-TURN_DEVIATIONS = 2.5  # beyond the median: 6 of 1000 normal numbers, most of them below the margin
 SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many leading zeros
 FLOAT_ROUNDING = 1e-9  # tolerance in deviations for a number at the limit
 
@@ -36,7 +28,7 @@ Side = Literal["both", "above", "below"]
 class Flag(NamedTuple):
     """A flag of a subject."""
 
-    column: str  # from `tetopt.cohort.numbers`, or "violated", "label", "duplicate"
+    column: str  # from `tetopt.cohort.numbers`, or "violated" or "label"
     words: str  # the reason, on one line
     score: float  # robust deviations; inf for oddities that are not numbers
 
@@ -54,7 +46,6 @@ class Quantity(NamedTuple):
 
 # The least scales are differences too small to inspect an image: 5 % of a volume, 1 degree, 0.002 of rho.
 QUANTITIES = (
-    Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, LEAST_LIKENESS),
     Quantity("energies.E_D_fraction_of_variance", "E_D's fraction of the variance", "", "both", True, 0.05),
     Quantity("quality.mean_rho", "mean rho", "", "both", False, 0.002),
     Quantity("quality.min_dihedral", "smallest angle", "degrees", "below", False, 1.0),
@@ -69,10 +60,6 @@ QUANTITIES = (
 GRID_COLUMNS = {
     "grid.orientation": "orientation", "grid.spacing_mm": "voxels in mm", "grid.shape": "voxels along the axes",
     "versions.tetopt": "version of tetopt",
-}  # fmt: skip
-TURN_WORDS = {
-    "thumbnail.left_right": "left and right exchanged", "thumbnail.back_front": "back and front exchanged",
-    "thumbnail.upside_down": "up and down exchanged",
 }  # fmt: skip
 
 
@@ -96,15 +83,14 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     -------
     list of list of Flag
         For each row: violated requirements; labels without a cell, and labels that 9 of 10 others have and its image
-        lacks, or vice versa; an image shared with another subject; another orientation, spacing or shape than two
-        thirds have; with 8 or more subjects, a picture clearly more like the others' flipped pictures, and numbers more
-        than `limit` robust deviations from the median. 2-D and 3-D meshes are compared separately.
+        lacks, or vice versa; another orientation, spacing or shape than two thirds have; with 8 or more subjects,
+        numbers more than `limit` robust deviations from the median. 2-D and 3-D meshes are compared separately.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
     for ndim, places in _groups(rows).items():
         own = [rows[place] for place in places]
         names = {number: name for row in reversed(own) for number, name in row.label_names.items()}
-        for flagged_by in (_violations, _lost, _absent, _doubled, _grids, _turned):
+        for flagged_by in (_violations, _lost, _absent, _grids):
             for place, flag in flagged_by(own, names):
                 flags[places[place]].append(flag)
         dimension = 2 if ndim == 2 else 3
@@ -194,25 +180,6 @@ def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
                     yield place, Flag("label", f"label {words} in its image: {beside}", np.inf)
 
 
-def _doubled(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Yield flags of images that several subjects share."""
-    same: dict[Value, list[int]] = defaultdict(list)
-    for place, row in enumerate(rows):
-        if row.numbers.get("image_sha256") is not None:
-            same[_whole_image(row)].append(place)
-    for places in same.values():
-        for place in places if len(places) > 1 else ():
-            other = rows[next(each for each in places if each != place)].key
-            more = f" and {len(places) - 2} more" if len(places) > 2 else ""
-            yield place, Flag("duplicate", f"the same image as {other}{more}", np.inf)
-
-
-def _whole_image(row: Row) -> str:
-    """Identify the meshed image by the file's checksum and selected part."""
-    part = [row.numbers.get(f"options.{name}") for name in ("volume", "crop", "slice")]
-    return f"{row.numbers['image_sha256']} {part}"
-
-
 def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     """Yield flags of orientations and the like that differ from a majority."""
     for column, words in GRID_COLUMNS.items():
@@ -223,33 +190,6 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         for place, text in enumerate(texts):
             if text is not None and text != usual:
                 yield place, Flag(column, f"{words} {text}: {count} of {len(known)} have {usual}", np.inf)
-
-
-def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Yield flags of pictures more like the others' flipped pictures, if the others clearly are not."""
-    for column, words in TURN_WORDS.items():
-        places = [place for place, row in enumerate(rows) if present([row.numbers.get(column)])]
-        values = np.array(present(row.numbers.get(column) for row in rows))
-        n_usual = int((values < 0.0).sum())
-        if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_FRACTION * len(values) - FLOAT_ROUNDING:
-            continue  # too few, or unclear which of them are flipped
-        middle = float(np.median(values))
-        spread = MAD_OF_NORMAL * float(np.median(np.abs(values - middle)))
-        if middle + SIDED_DEVIATIONS * spread > -TURN_MARGIN:
-            continue  # a symmetric shape
-        least = max(TURN_MARGIN, -TURN_FRACTION * middle, middle + TURN_DEVIATIONS * spread)
-        likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
-        for k in np.flatnonzero(values >= least).tolist():
-            if _is_like(rows[places[k]], values[k], likeness):
-                reason = f"its picture is more like the others' with {words}; not so for {n_usual} of {len(values)}"
-                yield places[k], Flag(column, reason, np.inf)
-
-
-def _is_like(row: Row, margin: float, likeness: list[float]) -> bool:
-    """Return whether a flipped picture is as similar to the others as they are; a cropped picture is not."""
-    turned = present([row.numbers.get("thumbnail.likeness")])[0] + margin
-    score = deviations(np.array([*likeness, turned]), False, LEAST_LIKENESS)[-1]
-    return bool(score > -limit(len(likeness)))
 
 
 def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:

@@ -26,7 +26,6 @@ from tetopt.cohort.layout import (
     subject_folder,
     thumbnail_path,
 )
-from tetopt.cohort.likeness import likenesses
 from tetopt.geometry.box import world_axes
 from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole
@@ -81,17 +80,10 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     Returns
     -------
     list of Row
-        Numbers include those of `tetopt.cohort.likeness`. A subject with unreadable files counts as failed. If a run
-        failed, the numbers of an older mesh are left out.
+        A subject with unreadable files counts as failed. If a run failed, the numbers of an older mesh are left out.
     """
     keys = {*_keys_there(out), *(expected or ())}
-    rows = [row_of(out, key) for key in sorted(keys, key=natural_order)]
-    meshes = [row for row in rows if row.status in ("done", "violated")]
-    names = [row.files.get("thumbnail") for row in meshes]
-    for row, likeness in zip(meshes, likenesses([None if name is None else out / name for name in names]), strict=True):
-        if likeness is not None:
-            row.numbers.update((f"thumbnail.{name}", _scalar(value)) for name, value in likeness._asdict().items())
-    return rows
+    return [row_of(out, key) for key in sorted(keys, key=natural_order)]
 
 
 def natural_order(text: str) -> list[tuple[int, str]]:

@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, label_quantities, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
-from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Value, description, present, save_table
 from tetopt.errors import InputError
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
@@ -24,6 +23,7 @@ PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64; with more subje
 LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # per subject; the TSV table has all
+THUMBNAIL_BYTES = 32_768  # of one of tetopt's, at most: pictures of noise have half of that
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # other files are not embedded in the page
 SHOWN_DIGITS = 4  # of numbers in the page
 LISTED_VALUES = 6  # of an option that differs; with more, only their number is shown
