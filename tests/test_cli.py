@@ -523,26 +523,37 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
 @pytest.mark.parametrize("width", ["80", "120"])
 def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys, width):
     monkeypatch.setenv("COLUMNS", width)
-    for words in ((), ("mesh",), ("fem",)):
-        assert exit_code(*words, "--help") == 0
+    for words in (("--help",), ("mesh", "--help"), ("mesh", "--help-all"), ("fem", "--help")):
+        assert exit_code(*words) == 0
         text = capsys.readouterr().out
         assert "bool" not in text
-        assert re.search(r"--help +-h +Show this message", text)
-        assert not words or {"octree", "bcc", "five-tet"} <= set(re.findall(r"[\w-]+", text)) or words == ("fem",)
+        assert re.search(r"--help(,--help-all)? +-h +Show this message", text)
+        assert words != ("mesh", "--help-all") or {"octree", "bcc", "five-tet"} <= set(re.findall(r"[\w-]+", text))
+
+
+def groups_of_help(capsys, *words):
+    """The names of the options that the help shows, by its groups."""
+    assert exit_code(*words) == 0
+    groups = re.split(r"^╭─ (.+?) ─+╮$", capsys.readouterr().out, flags=re.M)[1:]
+    pairs = zip(groups[::2], groups[1::2], strict=True)
+    return {name: re.findall(r"^│ [ *]*(--[a-z-]+)", text, re.M) for name, text in pairs if name != "Arguments"}
 
 
 def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
-    """Each of at most fifteen options, and the help."""
+    """Each of at most fifteen options, and the help; without `--help-all` the twenty that most users take."""
     monkeypatch.setenv("COLUMNS", "80")
-    assert exit_code("mesh", "--help") == 0
-    groups = re.split(r"^╭─ (.+?) ─+╮$", capsys.readouterr().out, flags=re.M)[1:]
-    pairs = zip(groups[::2], groups[1::2], strict=True)
-    sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
-    assert sizes.pop("Arguments") == 0
-    assert sizes == {
+    every = groups_of_help(capsys, "mesh", "--help-all")
+    assert {name: len(options) for name, options in every.items()} == {
         "Options": 5, "Region and labels": 15, "Number and size of cells": 9, "Initial mesh": 4,
         "Optimisation": 11, "Meshing in parts": 4, "For the solver": 13,
     }  # fmt: skip
+    shown = groups_of_help(capsys, "mesh", "--help")
+    assert sum(map(len, shown.values())) == 20 + 1
+    assert all(set(options) < set(every[name]) or name == "Options" for name, options in shown.items())
+    assert {"--output", "--mask", "--nodes", "--young", "--load"} <= {
+        each for group in shown.values() for each in group
+    }
+    assert groups_of_help(capsys, "cohort", "--help")["Optimisation"] == every["Optimisation"]  # has no shorter one
 
 
 def test_help_lists_the_commands(capsys):

@@ -42,7 +42,14 @@ COMMANDS = {
     "demo": "mesh",
 }
 
-
+# The options that the help of a command shows; `--help-all` shows all.
+SHOWN_OPTIONS = {
+    "mesh": (
+        "output", "json_path", "figures", "force", "mask", "mask_label", "background", "labels", "merge", "label_names",
+        "nodes", "target_error", "edge_size", "cells_across", "order", "young", "nu", "loads", "max_seconds", "threads",
+    ),
+}  # fmt: skip
+HELP_ALL = "--help-all"
 COLLECTED_AT = 50_000, 20, 20  # new objects, and collections of a generation; Python's own are 700, 10, 10
 LAYER_POOLS = {"omp": "omppool", "tbb": "tbbpool", "workqueue": "workqueue"}  # numba's threading layers, and modules
 LAYER_KINDS = ("default", "safe", "threadsafe", "forksafe")
@@ -65,7 +72,22 @@ class _Plain:
 
 
 class _Command(_Plain, TyperCommand):
-    pass
+    """A command, whose help shows its `SHOWN_OPTIONS` if it has some."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters; those that the help does not show are hidden."""
+        parameters = super().get_params(ctx)
+        shown = SHOWN_OPTIONS.get(str(self.name))
+        if shown is None:
+            return parameters
+        for each in parameters:
+            is_option = getattr(each, "param_type_name", "") == "option" and each.name != "help"
+            each.hidden = is_option and each.name not in shown and HELP_ALL not in ctx.obj
+        return parameters
+
+    def get_help_option_names(self, ctx: Any) -> list[str]:
+        """Return the names of the help in an order that does not change."""
+        return sorted(super().get_help_option_names(ctx))
 
 
 class _Group(_Plain, TyperGroup):
@@ -148,7 +170,11 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
     chosen = next((word for word in arguments if not word.startswith("-")), None)  # no option before it takes a value
     for name in COMMANDS:
         if name == chosen:
-            app.command(name, cls=_Command)(loaded_command(name))
+            about: dict[str, Any] = {}
+            if name in SHOWN_OPTIONS:
+                about["context_settings"] = {"help_option_names": ["-h", "--help", HELP_ALL]}
+                about["epilog"] = f"{HELP_ALL} shows all options."
+            app.command(name, cls=_Command, **about)(loaded_command(name))
         else:
             app.command(name, help=help_line(name))(lambda: None)
     return app
