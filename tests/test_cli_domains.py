@@ -227,7 +227,7 @@ def test_a_label_never_vanishes_silently(tmp_path, capsys):
     command = ["mesh", path, "--labels", path, "--uniform", "--nodes", "60", "--iterations", "0"]
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--free-volumes") == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "no cell has label 3, of more than 200 voxels; allow more nodes" in said
+    assert "no voxel of label 3, of more than 200 voxels, lies in a cell with that label; allow more nodes" in said
     assert "no cell has label 1, 2, of 200 voxels or fewer" in said
     # Labels whose volumes are kept have cells there, too.
     assert exit_code(*command, "-o", tmp_path / "b.vtu", "--json", tmp_path / "b.json") == 0
@@ -322,7 +322,7 @@ def test_intensities_are_no_labels(inputs, tmp_path, capsys):
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
     command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
     exit_code(*command)
-    assert "smooth-interfaces 0, if this is a label image" in " ".join(capsys.readouterr().err.split())
+    assert "check that these are labels, not intensities" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):

@@ -1,5 +1,7 @@
 """The fast engine: its gradients, its moves, its minimum angle, and its laws on phantoms."""
 
+import itertools
+
 import naive
 import numba
 import numpy as np
@@ -461,6 +463,15 @@ def test_refuses_flat_and_folded_starts():
     if wrong.any():
         with pytest.raises(tetopt.InputError, match="cells overlap"):
             tetopt.optimize(image, tetopt.Mesh(folded, cells), iterations=1)
+
+
+@pytest.mark.parametrize(("rise", "ended"), [(0.0, "converged"), (1e-5, "converged"), (0.01, "iterations")])
+def test_a_run_whose_energy_rises_has_not_converged(rise, ended, monkeypatch):
+    """As it may where interfaces follow their surfaces."""
+    image, blocks = CASES["3-D"]
+    energies_seen = itertools.count()
+    monkeypatch.setattr(Run, "E", lambda _: 1.0 + rise * next(energies_seen))
+    assert tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=blocks), iterations=4).ended == ended
 
 
 def test_stops_and_tells_why():

@@ -149,14 +149,18 @@ def test_labels_without_cells():
     assert "labels" not in result.violated
     none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
     assert violated(target, none) == {
-        "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
+        "labels": "no voxel of label 7, of more than 200 voxels, lies in a cell with that label; allow more nodes, or "
+        "a higher `label_weight`"
     }
+    elsewhere = none.labels.copy()
+    elsewhere[np.flatnonzero(result.labels == 3)[0]] = 7
+    assert violated(target, none._replace(labels=elsewhere)) == violated(target, none)
     assert violated(target, result._replace(labels=None)) == {}
     # Within a mask label 0 is a label like the others, and that of voxels outside does not count.
     within = content(image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine))
     no_zero = result._replace(labels=np.where(result.labels == 0, 3, result.labels))
-    assert "no cell has label 0" in violated(target, no_zero)["labels"]
-    assert "no cell has label 0" in violated(within, no_zero)["labels"]
+    assert "no voxel of label 0" in violated(target, no_zero)["labels"]
+    assert "no voxel of label 0" in violated(within, no_zero)["labels"]
     box = np.zeros(image.shape)
     box[15:25, 1:7] = 1.0
     inside = content(image, tetopt.Image(labels, image.affine), tetopt.Image(box, image.affine))

@@ -6,7 +6,7 @@ the command exits with status 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from math import prod
 
@@ -27,7 +27,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
-LABEL_VOXELS = 200  # a label with more voxels must have cells
+LABEL_VOXELS = 200  # a label with more voxels must have cells that contain some
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
 BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
@@ -56,7 +56,8 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
         initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
         two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask.
         `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
-        manifold. `labels`: labels of more than 200 voxels without cells. A requirement that cannot be checked, for lack
+        manifold. `labels`: labels of more than 200 voxels none of which lies in a cell
+        with that label. A requirement that cannot be checked, for lack
         of memory, counts as violated, with the reason, and the mesh is kept.
     """
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
@@ -184,15 +185,20 @@ def _violated_labels(content: Content, result: MeshingResult) -> dict[str, str]:
     members = content.memberships
     if members is None or result.labels is None:
         return {}
-    is_inside = cell_of_voxel(content.image, result.mesh) >= 0 if content.region is None else content.region.inside
-    inside = members.partition[is_inside]
-    counts = np.bincount(inside.ravel(), minlength=len(members.labels))
-    is_large = counts > LABEL_VOXELS * members.parts
-    lost = [str(label) for label in members.labels[is_large] if label not in result.labels]
-    if not lost:
-        return {}
-    words = f"no cell has label {', '.join(lost)}, of more than {LABEL_VOXELS} voxels"
-    return {"labels": f"{words}; allow more nodes, or a higher `label_weight`"}
+    owner = cell_of_voxel(content.image, result.mesh)
+    is_inside = owner >= 0 if content.region is None else content.region.inside
+    counts = np.bincount(members.partition[is_inside].ravel(), minlength=len(members.labels))
+    is_right = (owner >= 0) & (members.labels[members.partition] == result.labels[owner])
+    is_kept = np.bincount(members.partition[is_right].ravel(), minlength=len(members.labels)) > 0
+    lost = members.labels[(counts > LABEL_VOXELS * members.parts) & ~is_kept]
+    return (
+        {"labels": f"{lost_words(map(str, lost))}; allow more nodes, or a higher `label_weight`"} if len(lost) else {}
+    )
+
+
+def lost_words(labels: Iterable[str]) -> str:
+    """Say that large labels have no cells, or have them elsewhere alone."""
+    return f"no voxel of label {', '.join(labels)}, of more than {LABEL_VOXELS} voxels, lies in a cell with that label"
 
 
 def _volume(mesh: Mesh) -> float:

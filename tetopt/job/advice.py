@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.requirements import LABEL_VOXELS
+from tetopt.engine.requirements import LABEL_VOXELS, lost_words
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
@@ -130,10 +130,9 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
         is_helped = any(row.label not in pockets for row in rows)
         return {"remedy": remedy, "wants": "smaller"} if is_helped else {}
 
-    if large := [row for row in lost if row.voxels > LABEL_VOXELS]:
-        names = ", ".join(words[row.label] for row in large)
-        text, remedy = f"no cell has label {names}, of more than {LABEL_VOXELS} voxels", "allow more nodes, or a higher"
-        yield Problem(text, name="labels", **smaller(large, f"{remedy} `label_weight`"))
+    if large := [row for row in labels if row.voxels > LABEL_VOXELS and (row.is_lost or row.dice == 0.0)]:
+        text = lost_words(words[row.label] for row in large)
+        yield Problem(text, name="labels", **smaller(large, "allow more nodes, or a higher `label_weight`"))
     if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
         yield Problem(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
     ratios = {row: row.mesh_volume / row.volume for row in labels if not row.is_lost and row.mesh_volume > 0.0}
@@ -146,7 +145,7 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     poor = [row for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE and row not in large]
     if poor:
         names = listed([words[row.label] for row in poor], 5)
-        remedy = "allow more nodes, or follow every voxel with `smooth_interfaces` 0, if this is a label image"
+        remedy = "allow more nodes, or check that these are labels, not intensities"
         yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
 
 
