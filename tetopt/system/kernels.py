@@ -84,13 +84,24 @@ def links() -> Any:
                     _links[0] = import_module("tetopt.system.kernel_links")
                     check_links()
                 except Exception as error:  # any kind: numba's internals may be gone, or behave differently
-                    _links[0] = None
-                    warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
+                    _unlink(error)
     return _links[0]
+
+
+def _unlink(error: Exception) -> None:
+    """Turn all kernels into plain numba functions, as linking fails."""
+    _links[:] = [None]
+    warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
+    for kernel in ALL_KERNELS:
+        for name in ("signature", "dispatcher", "compiled", "type", "symbol", "address", "loop"):
+            vars(kernel).pop(name, None)
+        kernel.is_linked = False
 
 
 def packed(value: Any) -> Any:
     """Lay out a record for kernels; return any other value, including a laid-out record, unchanged."""
+    if links() is None and hasattr(value, "kept"):  # laid out before a later kernel failed to link
+        value = value.kept[0]
     if numba.config.DISABLE_JIT or not (isinstance(value, tuple) and hasattr(value, "_fields")):
         return value
     return cast(value, by_value(type(value)), "argument") if links() is None else links().Packed(value)
@@ -164,11 +175,17 @@ class Kernel:
             numba.get_num_threads()  # adds the threads' own functions to the linker
             for unit in units_of(self.function):
                 unit.link()
-            self._make_known()
+            try:
+                self._make_known()
+            except Exception as error:  # any kind, as in `links`
+                if links() is None:
+                    raise
+                _unlink(error)
+                self.link()
             self.is_linked = True
 
     def _make_known(self) -> None:
-        """Add its own symbol to the linker; an entry has none."""
+        """Compile it, and add its own symbol to the linker; an entry has none, and Python's first call compiles it."""
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -489,26 +506,43 @@ def _own_compiled(records: Any) -> Any:
 
 class _Row(NamedTuple):
     x: Floats1
+    factor: float
 
 
-def _double(row: _Row, number: int) -> None:
+class _Rows(NamedTuple):
+    row: _Row
+    count: int
+
+
+def _multiply(rows: _Rows, number: int) -> None:
     if number < 0:
         raise MemoryError
-    row.x[number] *= 2.0
+    factors = np.full(rows.count, rows.row.factor)
+    rows.row.x[number] *= factors[number]
 
 
-def _double_both(row: Any, address: int, place: int) -> tuple[bool, bool]:
-    _task(row, 0)
+def _call(rows: Any, address: int, place: int) -> tuple[bool, bool]:
+    _task(rows, 0)
     return _fails(address, place, 1), _fails(address, place, -1)
 
 
 def check_links() -> None:
-    """Compile a unit and call it by its symbol and its address; raises an error of any kind if that fails."""
-    doubled = Unit(_double)
-    ALL_KERNELS.remove(doubled)
-    doubled._make_known()
-    both = njit(cache=True)(_versioned(_double_both, _task=doubled, _fails=links().fails))
-    row = packed(_Row(np.ones(2)))
-    failures = both(row, doubled.address, row.address)
-    if failures != (False, True) or list(row.kept[0].x) != [2.0, 2.0]:
-        raise RuntimeError(f"a unit doubled ones to {row.kept[0].x}, its failures are {failures}")
+    """Compile a unit of nested records that allocates; call it by symbol, by address, and in the parallel loop.
+
+    Raises an error of any kind if one of these fails.
+    """
+    multiplied = Unit(_multiply)
+    ALL_KERNELS.remove(multiplied)
+    multiplied._make_known()
+    called = njit(cache=True)(_versioned(_call, _task=multiplied, _fails=links().fails))
+    x = np.ones(3)
+    rows = packed(_Rows(_Row(x, 2.0), len(x)))
+    failures = called(rows, multiplied.address, rows.address)
+    n_threads = numba.get_num_threads()
+    numba.set_num_threads(1)  # OpenMP starts no threads then, which a fork of the user's would not survive
+    try:
+        n_failed = links().run(multiplied.address, rows.address, len(x))
+    finally:
+        numba.set_num_threads(n_threads)
+    if failures != (False, True) or n_failed != 0 or x.tolist() != [4.0, 4.0, 2.0]:
+        raise RuntimeError(f"a unit changed ones to {x}, its failures are {failures} and {n_failed}")
