@@ -84,8 +84,7 @@ def save_run(out, key, run, picture=None, suffix=".vtu"):
 def save_failure(out, key, reason):
     (out / "logs").mkdir(parents=True, exist_ok=True)
     log_path(out, key).write_text("tetopt: " + reason)
-    record = {"key": key, "reason": reason, "attempts": 2, "seconds": 3.0, "peak_bytes": 8e8, "predicted_bytes": 1.3e9}
-    failure_path(out, key).write_text(json.dumps(record))
+    failure_path(out, key).write_text(json.dumps({"key": key, "reason": reason, "command": "tetopt mesh"}))
 
 
 ODD = {  # what is wrong with each of these, of a hundred

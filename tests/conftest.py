@@ -72,6 +72,18 @@ def described_numbers():
         yield
 
 
+@pytest.fixture(scope="session")
+def scheduler():
+    """The address of one with a worker in this process: a cohort there starts no other, and loads no kernels again."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address="127.0.0.1:0",
+        silence_logs=50,
+    ) as cluster:  # fmt: skip
+        yield cluster.scheduler_address
+
+
 @pytest.fixture(scope="module")
 def read_here():
     """Meshes are read in this process: the child of each takes a third of a second, and `tests/io` sees it at work."""

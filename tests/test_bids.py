@@ -47,7 +47,7 @@ def test_arguments_that_are_none(arguments, capsys):
 
 
 @pytest.mark.full
-def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
+def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys, scheduler, read_here):
     """One subject while another run has another's lock; the group waits for that, and tells of it."""
     raw, out = tmp_path / "raw", tmp_path / "out"
     for label in ("01", "02"):
@@ -56,7 +56,7 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
     (raw / "dataset_description.json").write_text('{"Name": "x", "BIDSVersion": "1.8.0"}')
     begin(out)
     with locked(out, ["sub-02"]):
-        options = ["--nodes", "60", "--iterations", "1"]
+        options = ["--nodes", "60", "--iterations", "0", "--scheduler", scheduler]
         assert main([str(raw), str(out), "participant", "--participant_label", "02", *options]) == 2
         assert "sub-02: another run is writing there" in capsys.readouterr().err
         assert main([str(raw), str(out), "participant", "--participant_label", "01", *options]) == 0

@@ -119,12 +119,12 @@ def test_what_cannot_be_merged(folder, capsys):
     assert not (folder / "x.vtu").exists()
 
 
-def test_a_cohort_merges_by_an_option_and_by_a_column(folder):
+def test_a_cohort_merges_by_an_option_and_by_a_column(folder, scheduler):
     (folder / "g.toml").write_text('white = [2, 41]\nrest = "*"\n')
     (folder / "s.tsv").write_text(
         "subject\timage\tlabels\tmerge\n1\ta.nii.gz\tl.nii.gz\tn/a\n2\ta.nii.gz\tl.nii.gz\tg.toml\n"
     )
-    lattice = ["--spacing", "4", "--iterations", "0", "--workers", "1"]
+    lattice = ["--spacing", "4", "--iterations", "0", "--scheduler", scheduler]
     assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out", "--merge", "synthseg", *lattice) == 0
     runs = {path.parent.name: json.loads(path.read_text()) for path in sorted((folder / "out").rglob("*_mesh.json"))}
     names = [run["label_names"] for run in runs.values()]

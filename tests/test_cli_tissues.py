@@ -133,14 +133,14 @@ def test_a_job_takes_a_list(folder):
     assert tetopt.Job.from_json(job.to_json()) == job
 
 
-def test_a_cohort_finds_those_of_each_subject(folder):
+def test_a_cohort_finds_those_of_each_subject(folder, scheduler):
     (folder / "s.tsv").write_text(
         "subject\timage\ttissues\n1\ta.nii.gz\tgrey.nii.gz, white.nii.gz\n2\ta.nii.gz\tn/a\n3\ta.nii.gz\tgrey.nii.gz\n"
     )
     for name in ("grey", "white"):
         (folder / f"sub-2_{name}.nii.gz").write_bytes((folder / f"{name}.nii.gz").read_bytes())
     pattern = ",".join(f"{folder}/sub-{{subject}}_{name}.nii.gz" for name in ("grey", "white"))
-    few = [*LATTICE, "--workers", "1", "--tissues", pattern]
+    few = [*LATTICE, "--scheduler", scheduler, "--tissues", pattern]
     assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out", *few) == 0
     runs = [json.loads(path.read_text()) for path in sorted((folder / "out").rglob("*_mesh.json"))]
     assert [run["label_names"] for run in runs] == [

@@ -220,7 +220,7 @@ def test_every_public_module_is_on_the_page():
 
 def test_only_the_command_names_options():
     """Messages of the library name arguments, between backticks, which `tetopt.cli` turns into options."""
-    others = {"tetopt.cohort.run", "tetopt.workers"}  # start programs, or say how to
+    others = {"tetopt.workers"}  # says how to start programs
     option = re.compile(r"(?<!\S)[`(]?--[a-z]")
     named = [
         f"{module_name(path)}:{node.lineno} {node.value[:60]!r}"

@@ -70,8 +70,8 @@ def run(pool, tmp_path):
     """A function that runs tasks on them: their results or errors by name."""
     pool.client.wait_for_workers(2, timeout=60)  # one of the test before may be starting again
 
-    def outcomes(function, names, **options):
-        return {name: error or done for name, done, error in run_tasks(pool, function, names, str(tmp_path), **options)}
+    def outcomes(function, names):
+        return {name: error or done for name, done, error in run_tasks(pool, function, names, str(tmp_path))}
 
     return outcomes
 
@@ -93,7 +93,7 @@ def test_workers_here_have_their_threads_and_memory_and_leave_nothing(tmp_path, 
     with workers(Share(1, 3, LIMIT), None, None) as one:
         assert one.words() == "1 task at a time, each of 3 threads"
         assert one.client.scheduler.address.split("://")[1].startswith("127.0.0.1:")
-        ended = list(run_tasks(one, settings, list("bca"), str(tmp_path), is_alone=True))
+        ended = list(run_tasks(one, settings, list("bca"), str(tmp_path)))
     assert [done for _, done, _ in ended] == [(name, "3", LIMIT) for name in "bca"]  # in their order
     assert not any("spawn_main" in " ".join(psutil.Process(pid).cmdline()) for pid in processes() - before)
     assert capfd.readouterr() == ("", "")
@@ -124,7 +124,7 @@ def deadly(folder, n_deaths, name):
     return name
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 1), list("abc"))
     assert ended == {"a": "a", "b": "b", "c": "c"}
@@ -132,7 +132,7 @@ def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_a_task_that_ends_its_workers_or_fails_takes_no_others_with_it(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 9), ["a", "b", "error", *"cdef"])
     error = ended.pop("b")
@@ -193,9 +193,9 @@ def of_session(number):
 
 @pytest.fixture(scope="module")
 def others():
-    """A cluster of somebody else's, within this process: 2 workers with 2 tasks at a time and 8 GB each."""
+    """A cluster of somebody else's, within this process: 2 workers with 8 GB each."""
     with LocalCluster(
-        n_workers=2, threads_per_worker=2, processes=False, protocol="tcp://", memory_limit="8GB",
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", memory_limit="8GB",
         dashboard_address="127.0.0.1:0", silence_logs=50,
     ) as cluster:  # fmt: skip
         yield cluster
@@ -210,11 +210,11 @@ def limit_of(_name):
 
 def test_workers_of_a_scheduler_that_runs(others, tmp_path):
     with workers(NOTHING, others.scheduler.address, None) as pool:
-        assert (pool.slots(), pool.threads) == (4, 1)
+        assert (pool.slots(), pool.threads) == (2, 1)
         ended = run_tasks(pool, limit_of, range(9), str(tmp_path))
-        assert [each for _, each, _ in ended] == [4 * GB] * 9
+        assert [each for _, each, _ in ended] == [8 * GB] * 9
     with workers(NOTHING, others.scheduler.address, 3) as pool:
-        assert pool.words() == "4 tasks at a time, each of 3 threads"
+        assert pool.words() == "2 tasks at a time, each of 3 threads"
     assert len(others.scheduler.workers) == 2  # they go on
     assert memory_limit() == float("inf")
 
@@ -222,21 +222,37 @@ def test_workers_of_a_scheduler_that_runs(others, tmp_path):
 def test_workers_that_cannot_run_tasks_are_refused(others, tmp_path, monkeypatch):
     """Each at its first task, as workers come and go."""
     with workers(NOTHING, others.scheduler.address, None) as pool:
-        with pytest.raises(UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"):
-            list(run_tasks(pool, limit_of, "abc", str(tmp_path), is_alone=True))
         with pytest.raises(UnfitWorker, match=r"cannot access .*no; expected an output folder on a file system that"):
             list(run_tasks(pool, limit_of, "abc", str(tmp_path / "no")))
         versions = iter(["tetopt 9 and Python 3.11", "tetopt 8 and Python 3.11"])
         monkeypatch.setattr(module, "_versions", lambda: next(versions, "tetopt 8 and Python 3.11"))
         with pytest.raises(UnfitWorker, match=r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and"):
             list(run_tasks(pool, limit_of, "a", str(tmp_path)))
+    with (
+        LocalCluster(
+            n_workers=1,
+            threads_per_worker=2,
+            processes=False,
+            protocol="tcp://",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
+        ) as cluster,
+        workers(NOTHING, cluster.scheduler.address, None) as pool,
+        pytest.raises(UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"),
+    ):
+        list(run_tasks(pool, limit_of, "abc", str(tmp_path)))
 
 
 def test_tasks_wait_for_workers_and_a_lost_scheduler_is_said(tmp_path):
     """Jobs of a batch system come after hours."""
     with (
         LocalCluster(
-            n_workers=0, processes=False, protocol="tcp://", dashboard_address="127.0.0.1:0", silence_logs=50
+            n_workers=0,
+            threads_per_worker=1,
+            processes=False,
+            protocol="tcp://",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
         ) as cluster,
         workers(NOTHING, cluster.scheduler.address, None) as pool,
     ):

@@ -145,18 +145,18 @@ def workers(share: Share, scheduler: str | None, threads: int | None) -> Iterato
 
 
 def memory_limit() -> float:
-    """Return the memory limit for each task of the calling worker, bytes; infinite without one."""
+    """Return the memory limit of the calling worker, bytes; infinite without one."""
     from distributed import get_worker
 
     try:
         worker = get_worker()
     except ValueError:  # not in a worker
         return float("inf")
-    return (worker.memory_manager.memory_limit or float("inf")) / worker.state.nthreads
+    return worker.memory_manager.memory_limit or float("inf")
 
 
 def run_tasks(
-    pool: Workers, function: Callable[[Any], Any], names: Sequence[Any], mark: str, *, is_alone: bool = False
+    pool: Workers, function: Callable[[Any], Any], names: Sequence[Any], mark: str
 ) -> Iterator[tuple[Any, Any, BaseException | None]]:
     """Run tasks; yield the name of each as it ends, its result, and its error: the function's, or `WorkerEnded`.
 
@@ -170,9 +170,7 @@ def run_tasks(
     names : sequence
         Names, for example of files, in the order in which tasks begin.
     mark : str
-        Path of a file, which every worker must find.
-    is_alone : bool
-        A task takes all threads of its process, so that a worker may not run several.
+        Path of a file or folder, which every worker must find.
 
     Raises
     ------
@@ -181,7 +179,7 @@ def run_tasks(
     SchedulerLost
         The scheduler is gone.
     """
-    task = partial(_run, _versions(), mark, is_alone, function)
+    task = partial(_run, _versions(), mark, pool.threads, function)
     waiting, running = list(reversed(names)), dict[Any, Any]()
     try:
         while waiting or running:
@@ -196,8 +194,9 @@ def run_tasks(
         raise SchedulerLost("the scheduler no longer answers") from error
 
 
-def _run(versions: str, mark: str, is_alone: bool, function: Callable[[Any], Any], name: Any) -> Any:
-    """Run a task in a worker."""
+def _run(versions: str, mark: str, threads: int, function: Callable[[Any], Any], name: Any) -> Any:
+    """Run a task in a worker, with this number of threads."""
+    import numba
     from distributed import get_worker
 
     worker, wrong = get_worker(), ""
@@ -205,10 +204,12 @@ def _run(versions: str, mark: str, is_alone: bool, function: Callable[[Any], Any
         wrong = f"expected {versions} as here, got {_versions()}; install the same versions there"
     elif not os.path.exists(mark):
         wrong = f"cannot access {mark}; expected an output folder on a file system that all workers share"
-    elif is_alone and (n_tasks := worker.state.nthreads) > 1:
+    elif (n_tasks := worker.state.nthreads) > 1:
         wrong = f"expected one task at a time, got {n_tasks}; use dask worker --nthreads 1 --nworkers {n_tasks}"
     if wrong:
         raise UnfitWorker(f"worker {worker.address}: {wrong}")
+    numba.config.reload_config()  # the main program may have loaded numba before dask set the environment
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     return function(name)
 
 

@@ -131,7 +131,7 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
             return
         stage("workers begin")
         with workers(Share(n_workers, 1, worker_bytes), None, 1) as pool:
-            yield lambda names: _noted(_results(run_tasks(pool, _done, names, str(folder), is_alone=True)), done)
+            yield lambda names: _noted(_results(run_tasks(pool, _done, names, str(folder))), done)
             stage("the end")
 
     def watch(now: Round, history: list[IterationRecord]) -> None:

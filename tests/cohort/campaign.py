@@ -36,7 +36,7 @@ FAILURES = {
     "labels beside the image": (1, ("failed", "far.nii.gz"), False),
     "damaged header": (1, ("failed", "image.nii"), False),
     "requirement violated": (2, ("violated", "overlap with a Dice of only"), False),
-    "killed always": (1, ("failed", "SIGKILL"), True),
+    "killed always": (1, ("failed", "its worker ended, 2 times"), True),
     "killed once": (1, ("done", ""), False),
     "disk full": (1, ("failed", "File too large"), True),
 }
@@ -108,7 +108,7 @@ def processes_of(out):
 
 
 class Saboteur(threading.Thread):
-    """Kills runs of some subjects, and leaves others no room on the disk."""
+    """Kills workers of some subjects, and leaves others no room on the disk, as long as their runs have a folder."""
 
     def __init__(self, out, failures):
         super().__init__(daemon=True)
@@ -117,14 +117,17 @@ class Saboteur(threading.Thread):
 
     def run(self):
         while not self.is_over:
-            for number, words in processes_of(self.out).items():
-                if "mesh" in words and number not in self.seen:
-                    self.seen[number] = key = self.key_of(words)
-                    self.harm(number, key)
-            time.sleep(0.05)
-
-    def key_of(self, words):
-        return Path(words[words.index("-o") + 1]).name.partition("_desc")[0] if "-o" in words else ""
+            names = {path.name for path in (self.out / ".work").glob("sub-*.run-*")}
+            for name in names - self.seen.keys():
+                key, number = name.partition(".")[0], int(name.split("-")[2])
+                self.seen[name] = number
+                self.harm(number, key)
+            for name in self.seen.keys() - names:  # the worker goes on with others
+                with contextlib.suppress(ProcessLookupError):
+                    number = self.seen.pop(name)
+                    hard = resource.prlimit(number, resource.RLIMIT_FSIZE)[1]
+                    resource.prlimit(number, resource.RLIMIT_FSIZE, (hard, hard))
+            time.sleep(0.02)
 
     def harm(self, number, key):
         failure = self.failures.get(key)
@@ -132,7 +135,8 @@ class Saboteur(threading.Thread):
             if failure == "killed always" or (failure == "killed once" and not self.counts[key]):
                 os.kill(number, signal.SIGKILL)
             elif failure == "disk full":
-                resource.prlimit(number, resource.RLIMIT_FSIZE, (FILE_BYTES, FILE_BYTES))
+                hard = resource.prlimit(number, resource.RLIMIT_FSIZE)[1]
+                resource.prlimit(number, resource.RLIMIT_FSIZE, (FILE_BYTES, hard))
             else:
                 return
             self.counts[key] += 1

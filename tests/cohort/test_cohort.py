@@ -22,11 +22,13 @@ from tetopt import InputError, workers
 from tetopt.cohort import cohort as cohort_module
 from tetopt.cohort import estimate as estimate_module
 from tetopt.cohort import plan as cohort_plan
-from tetopt.cohort.layout import begin, locked
+from tetopt.cohort.layout import begin, locked, numbers_path
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.job.options import RunOptions
+
+pytestmark = pytest.mark.usefixtures("read_here")
 
 WAIT_SECONDS = 240  # a machine with much else to do still gets there
 
@@ -71,8 +73,7 @@ def test_a_cohort_from_python_is_that_of_the_command(small):
         tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")
 
 
-@pytest.mark.full
-def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_failed(small, capfd):
+def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_failed(small, capfd, scheduler):
     """Labels on another grid are taken to the image's."""
     image = tetopt.load_image(small / "a.nii.gz")
     far = np.array(image.affine)
@@ -81,7 +82,8 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     coarse = tetopt.Image(1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0]))
     tetopt.save_image(small / "coarse.nii.gz", coarse)
     (small / "cut.nii.gz").write_bytes((small / "a.nii.gz").read_bytes()[:300])
-    command = ["cohort", small / "t.tsv", "-o", small / "out", "--workers", 1, "--iterations", 1, "--nodes", 60]
+    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", 0, "--nodes", 60]
+    command += ["--scheduler", scheduler]
     labelled, far = ["01", "a.nii.gz", "coarse.nii.gz", "n/a"], ["03", "a.nii.gz", "far.nii.gz", "n/a"]
     write_rows(small, labelled, ["02", "cut.nii.gz", "n/a", "n/a"], far)
     assert exit_code(*command) == 1
@@ -92,7 +94,9 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     log = " ".join((small / "out" / "logs" / "sub-01.log").read_text().split())
     assert "resampled to the image's grid" in log
     for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
-        reason = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())["reason"]
+        failure = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())
+        reason = failure["reason"]
+        assert failure["command"].startswith(f"tetopt mesh -o {name}.vtu --")
         assert file in rows[name]["reason"] == reason in (small / "out" / "logs" / f"{name}.log").read_text()
         assert name in page
     assert list(meshes(small)) == ["sub-01"]
@@ -212,7 +216,7 @@ def test_threads_are_of_all_subjects_and_a_volume_of_the_first_image_is_an_optio
 
 
 def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
-    """A link to nothing, a file without a byte, a mask where others leave the background out, a place that is taken."""
+    """A link to nothing, an empty file, a mask where others leave the background out, numbers that are a link."""
     (small / "link.nii").symlink_to("nothing")
     (small / "empty.nii").touch()
     lines = ("subject\timage\tmask", "1\ta.nii.gz\t", "2\ta.nii.gz\ta.nii.gz", "3\tlink.nii\t", "4\tempty.nii\t")
@@ -220,10 +224,10 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
     begin(small / "out")
     (small / "out" / ".work" / "lock").touch()
     (small / "out" / "sub-ab").mkdir()
-    (small / "out" / "sub-ab" / "thesis.txt").touch()
+    numbers_path(small / "out", "sub-ab").symlink_to(small / "thesis.txt")
     said = refused(small, capsys, "--background", "3")
     assert len(said) == 4
-    for line, words in zip(said, ("line 3: --mask", "datalad get", "is empty", "sub-ab: contains files"), strict=True):
+    for line, words in zip(said, ("line 3: --mask", "datalad get", "is empty", "file, got a link"), strict=True):
         assert words in line
 
 

@@ -10,7 +10,7 @@ from cohorts import run_of, save_run, thumbnail
 from commands import assert_refused, exit_code
 
 from tetopt.cohort import plan as cohort_plan
-from tetopt.cohort.layout import begin, log_path, numbers_path, publish, restore, thumbnail_path
+from tetopt.cohort.layout import begin, clean, log_path, numbers_path, publish, thumbnail_path
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.errors import InputError
@@ -55,9 +55,8 @@ def pictures(out):
 ATTACKS = [
     *((".work", kind) for kind in ("file link", "folder link", "pipe", "file")),
     *((".work/lock", kind) for kind in ("hard link", "file link", "pipe", "folder")),
-    (".work/tetopt-manifest", "device link"), (".work/sub-01.before", "folder link"), (".work/...before", "folder"),
-    (".work/sub-01_...before", "folder"), (".work/sub-01.lock", "file link"),
-    (".work/sub-01.run-1.7", "folder link"), (".work/other", "folder link"), (".work/run-1", "pipe"),
+    (".work/tetopt-manifest", "device link"), (".work/...run-1", "folder"), (".work/sub-01.lock", "file link"),
+    (".work/sub-01.run-1", "folder link"), (".work/other", "folder link"), (".work/run-1", "pipe"),
     (".work/thesis.txt", "file"), (".work/thesis", "folder"),
     *(("logs", kind) for kind in ("folder link", "file")),
     *(("logs/sub-01.log", kind) for kind in ("file link", "pipe", "folder")),
@@ -130,7 +129,7 @@ def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, m
     assert f"tetopt: {out / KEY}: expected the subject's folder, got a link to" in capfd.readouterr().err
     assert content(out.parent) == whole
     with pytest.raises(InputError, match=f"^{out / KEY}: expected the subject's folder"):
-        publish(out / ".work" / "sub-01.run-1.7", out, KEY)
+        publish(out / ".work" / "sub-01.run-1", out, KEY)
     assert content(elsewhere) == before
 
 
@@ -146,39 +145,22 @@ def test_sessions_of_a_subject_that_is_a_link_are_not_replaced(out, image, capfd
     assert content(out.parent) == before
 
 
-def test_what_was_put_aside_is_not_moved_through_a_link(out):
-    (out / ".work" / "sub-01.before").mkdir()
-    (out / ".work" / "sub-01.before" / "note.txt").write_text("mine")
-    moved(out, out / KEY)
-    before = content(out.parent)
-    with pytest.raises(InputError, match=f"^{out / KEY}: expected the subject's folder"):
-        restore(out)
-    assert content(out.parent) == before
-
-
 def test_links_that_a_user_has_put_beside_a_mesh_stay_links(out):
-    """Through a new run, and through a crash between its renamings."""
     elsewhere = outside(out.parent)
     (out / KEY / "results").symlink_to(elsewhere)
     before = content(elsewhere)
-    for is_crashed in (False, True):
-        work = out / ".work" / "sub-01.run-1.7"
-        work.mkdir()
-        (work / "a.txt").write_text("new")
-        if is_crashed:
-            (out / KEY).rename(out / ".work" / "sub-01.before")
-            work.rename(out / KEY)
-            assert exit_code(*words(out, "--collect")) == 1  # what is there has no numbers
-        else:
-            publish(work, out, KEY)
-        assert (out / KEY / "results").readlink() == elsewhere
-        assert content(elsewhere) == before
+    work = out / ".work" / "sub-01.run-1"
+    work.mkdir()
+    (work / "a.txt").write_text("new")
+    publish(work, out, KEY)
+    assert (out / KEY / "results").readlink() == elsewhere
+    assert content(elsewhere) == before
 
 
 def test_foreign_files_that_come_during_a_run_do_not_keep_it_from_its_end(out):
     (out / ".work" / "thesis.txt").write_text("mine")
-    (out / ".work" / "sub-01.run-1.7").mkdir()
-    restore(out)
+    (out / ".work" / "sub-01.run-1").mkdir()
+    clean(out)
     assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "tetopt-manifest", "thesis.txt"]
 
 

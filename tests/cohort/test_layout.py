@@ -1,12 +1,13 @@
 """Places of a cohort's files: whose folder it is, who may write, and what a crash leaves."""
 
 import json
+import os
 import subprocess
 import sys
 
 import pytest
 
-from tetopt.cohort.layout import begin, check_out, locked, publish, restore, subject_folder
+from tetopt.cohort.layout import begin, check_out, clean, locked, mesh_name, publish, subject_folder
 from tetopt.errors import InputError
 
 
@@ -16,10 +17,13 @@ def out(tmp_path):
     return tmp_path / "out"
 
 
-def work_of(out, key, text):
-    folder = out / ".work" / f"{key}.run-1.7"
-    folder.mkdir()
+def work_of(out, key, text, *endings):
+    """Unfinished outputs of a subject: a file of this text, and others of its mesh's name."""
+    folder = out / ".work" / f"{key}.run-1"
+    folder.mkdir(exist_ok=True)
     (folder / "a.txt").write_text(text)
+    for ending in endings:
+        (folder / mesh_name(key, ending)).touch()
     return folder
 
 
@@ -49,26 +53,40 @@ def test_a_file_and_no_folder_are_refused(tmp_path):
 
 
 def test_what_is_published_takes_the_place_of_what_was_there(out):
+    """A crash before its numbers are there leaves a subject without any, which is run again."""
     for text in ("first", "second"):
-        publish(work_of(out, "sub-1_ses-a", text), out, "sub-1_ses-a")
-        assert (out / "sub-1" / "ses-a" / "a.txt").read_text() == text
-    assert not [each for each in (out / ".work").iterdir() if each.is_dir()]
+        work = work_of(out, "sub-1_ses-a", text)
+        (work / "figures").mkdir(exist_ok=True)
+        (work / "figures" / f"{text}.png").touch()
+        numbers = work / mesh_name("sub-1_ses-a", ".json")
+        numbers.touch()
+        publish(work, out, "sub-1_ses-a")
+        place = subject_folder(out, "sub-1_ses-a")
+        names = ["a.txt", "figures", f"figures/{text}.png", numbers.name]
+        assert sorted(str(each.relative_to(place)) for each in place.rglob("*")) == names
+        assert (place / "a.txt").read_text() == text
 
 
-def test_a_crash_between_renamings_loses_nothing(out):
-    publish(work_of(out, "sub-1", "first"), out, "sub-1")
-    subject_folder(out, "sub-1").rename(out / ".work" / "sub-1.before")
-    work_of(out, "sub-1", "never finished")
-    restore(out)
-    assert (out / "sub-1" / "a.txt").read_text() == "first"
-    assert not [each for each in (out / ".work").iterdir() if each.is_dir()]
+def test_numbers_come_last(out, monkeypatch):
+    publish(work_of(out, "sub-1", "first", ".json"), out, "sub-1")
+    work = work_of(out, "sub-1", "second", ".json", "_z.txt")
+    moved = []
+    monkeypatch.setattr(os, "replace", lambda old, _: moved.append(old.name))
+    publish(work, out, "sub-1")
+    assert moved[-1] == mesh_name("sub-1", ".json")
+    assert len(moved) == 3
+    assert [each.name for each in subject_folder(out, "sub-1").iterdir()] == ["a.txt"]
 
 
-def test_only_what_is_named_is_restored(out):
+def test_what_ended_runs_have_left_is_removed(out):
+    """Of the named subjects alone; of a scheduler's workers that still run them, which then give up."""
     work_of(out, "sub-1", "mine")
     other = work_of(out, "sub-2", "another run's")
-    restore(out, ["sub-1"])
-    assert [each for each in (out / ".work").iterdir() if each.is_dir()] == [other]
+    (out / ".work" / "sub-1.lock").touch()
+    clean(out, ["sub-1"])
+    assert sorted((out / ".work").iterdir()) == [out / ".work" / "sub-1.lock", other, out / ".work" / "tetopt-manifest"]
+    clean(out)
+    assert not other.exists()
 
 
 def locks(out, keys):
@@ -93,39 +111,13 @@ def test_runs_of_other_subjects_go_side_by_side(out):
         assert not locks(out, ["sub-2"])
 
 
-def test_what_a_killed_run_went_on_by_is_taken_away(out):
-    """Workers of a cluster that still run its subjects then give up, and the next run has the folder for itself."""
-    for name in ("run-1", "lock", "sub-1.lock"):
-        (out / ".work" / name).touch()
-    restore(out, ["sub-1"])
-    assert len(list((out / ".work").iterdir())) == 4
-    restore(out)
-    assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "sub-1.lock", "tetopt-manifest"]
-
-
 def test_what_a_user_has_put_beside_a_mesh_stays(out):
     publish(work_of(out, "sub-1", "first"), out, "sub-1")
     place = subject_folder(out, "sub-1")
     (place / "sub-1_desc-tetopt_mesh.inp").write_text("of another format")
     (place / "results").mkdir()
     (place / "results" / "stress.frd").write_text("mine")
-    work = work_of(out, "sub-1", "second")
-    (work / "a.txt").rename(work / "sub-1_desc-tetopt_mesh.vtu")
+    work = work_of(out, "sub-1", "second", ".vtu")
     publish(work, out, "sub-1")
     assert sorted(each.name for each in place.iterdir()) == ["a.txt", "results", "sub-1_desc-tetopt_mesh.vtu"]
     assert (place / "results" / "stress.frd").read_text() == "mine"
-
-
-@pytest.mark.parametrize("is_published_again", [False, True])
-def test_what_a_user_has_put_beside_a_mesh_outlives_a_crash(out, is_published_again):
-    """It may come when the new mesh is in its place and the user's files are not yet."""
-    publish(work_of(out, "sub-1", "new"), out, "sub-1")
-    aside = work_of(out, "sub-1", "old").rename(out / ".work" / "sub-1.before")
-    (aside / "note.txt").write_text("mine")
-    if is_published_again:
-        publish(work_of(out, "sub-1", "newer"), out, "sub-1")
-    restore(out)
-    place = subject_folder(out, "sub-1")
-    assert (place / "note.txt").read_text() == "mine"
-    assert (place / "a.txt").read_text() == ("newer" if is_published_again else "new")
-    assert not aside.exists()

@@ -1,207 +1,164 @@
 """Runs of subjects: whole or not at all, the same bytes as `tetopt mesh`, and why they failed."""
 
-import contextlib
 import json
 import os
 import shutil
-import signal
-import threading
-import time
-from pathlib import Path
+import warnings
 
 import numpy as np
-import psutil
 import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
 from tetopt.cohort import run as run_module
-from tetopt.cohort.layout import begin, failure_path, log_path, numbers_path, subject_folder
-from tetopt.cohort.run import Ended, SubjectTask, _reason, run_all, run_subject
-from tetopt.workers import Share, workers
+from tetopt.cohort.layout import begin, clean, failure_path, log_path, numbers_path, subject_folder
+from tetopt.cohort.run import SubjectTask, run_all, run_subject
+from tetopt.errors import InputError
+from tetopt.job.options import JobOptions
+from tetopt.job.plan import changed
+from tetopt.workers import WorkerEnded
 
-WORDS = ("--nodes=60", "--iterations=1", "--")
+pytestmark = pytest.mark.usefixtures("read_here")
 
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
     path = tmp_path_factory.mktemp("image") / "sphere.nii.gz"
-    assert exit_code("phantom", "sphere", "-o", path, "--voxel-mm", "5") == 0
+    assert exit_code("phantom", "sphere", "-o", path, "--voxel-mm", "6") == 0
     return path
 
 
-def job_in(out, image):
+def task_in(out, image):
     begin(out)
-    (out / ".work" / "run-1").touch()
-    return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, "run-1")
+    job = JobOptions(images=[image], output="mesh.vtu", nodes=60, iterations=1)
+    return SubjectTask("sub-1", job, ".vtu", out, 0.0, "tetopt mesh ...")
+
+
+def with_options(task, **options):
+    return task._replace(job=changed(task.job, **options))
 
 
 @pytest.fixture
-def job(tmp_path, image):
-    return job_in(tmp_path / "out", image)
+def task(tmp_path, image):
+    return task_in(tmp_path / "out", image)
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory, image):
     """A subject that was run, and how it ended."""
-    job = job_in(tmp_path_factory.mktemp("done") / "out", image)
-    failure_path(Path(job.out), "sub-1").write_text("{}")  # of a run before
-    return job, run_subject(job)
+    task = task_in(tmp_path_factory.mktemp("done") / "out", image)
+    return task, run_subject(task)
 
 
-@pytest.mark.full
 def test_a_subject_is_what_mesh_alone_writes(done, image, tmp_path):
     """To the byte, but for what differs from run to run: seconds, memory."""
-    job, ended = done
-    out = Path(job.out)
+    task, ended = done
     assert (ended.status, ended.reason) == ("done", "")
-    folder, alone, name = subject_folder(out, "sub-1"), tmp_path / "alone", "sub-1_desc-tetopt_mesh"
-    (alone / "figures").mkdir(parents=True)
+    folder, alone, name = subject_folder(task.out, "sub-1"), tmp_path / "alone", "sub-1_desc-tetopt_mesh"
     outputs = ["-o", alone / f"{name}.vtu", "--json", alone / f"{name}.json", "--figures", alone / "figures"]
-    assert exit_code("mesh", *WORDS[:-1], *outputs, "--threads", "1", image) == 0
+    alone.mkdir()
+    assert exit_code("mesh", "--nodes", 60, "--iterations", 1, *outputs, image) == 0
     names = sorted(str(path.relative_to(alone)) for path in alone.rglob("*"))
     assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) == names
     for path in [alone / each for each in names if each.endswith((".vtu", ".png"))]:
         assert (folder / path.relative_to(alone)).read_bytes() == path.read_bytes(), path
     first, second = (numbers_in(each / f"{name}.json") for each in (folder, alone))
+    assert ended.peak_bytes == first["memory"]["peak_bytes"]
     for numbers in (first, second):
         for key in ("seconds", "memory", "machine"):
             del numbers[key]
         numbers["history"] = [{**row, "seconds": 0} for row in numbers["history"]]
     assert first == second
-    assert not [each for each in (out / ".work").iterdir() if each.is_dir()]
-    assert not failure_path(out, "sub-1").exists()
+    assert not [each for each in (task.out / ".work").iterdir() if each.is_dir()]
+    assert "reading and preparing the image" in log_path(task.out, "sub-1").read_text()
 
 
-@pytest.mark.full
-def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, image, tmp_path):
+def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, tmp_path):
     """A log that is a file of two names is another file afterwards."""
-    job = done[0]._replace(out=str(shutil.copytree(done[0].out, tmp_path / "out")))
-    out = Path(job.out)
-    before = numbers_path(out, "sub-1").read_bytes()
+    task = done[0]._replace(out=shutil.copytree(done[0].out, tmp_path / "out"))
+    before = numbers_path(task.out, "sub-1").read_bytes()
     (tmp_path / "notes.txt").write_text("years of work")
-    log_path(out, "sub-1").unlink()
-    os.link(tmp_path / "notes.txt", log_path(out, "sub-1"))
-    ended = run_subject(job._replace(words=("--nodes=0", *job.words[1:])))
-    assert ended.status == "failed"
-    assert "nodes" in ended.reason
-    failure = json.loads(failure_path(out, "sub-1").read_text())
-    assert (failure["reason"], failure["attempts"]) == (ended.reason, 1)
-    assert ended.reason in log_path(out, "sub-1").read_text()
-    assert numbers_path(out, "sub-1").read_bytes() == before
+    log_path(task.out, "sub-1").unlink()
+    os.link(tmp_path / "notes.txt", log_path(task.out, "sub-1"))
+    ended = run_subject(with_options(task, nodes=0))
+    assert (ended.status, ended.reason) == ("failed", "`nodes`: expected a whole number from 5 to 50000000, got 0")
+    assert log_path(task.out, "sub-1").read_text() == f"{ended.reason}\n"
+    assert numbers_path(task.out, "sub-1").read_bytes() == before
     assert (tmp_path / "notes.txt").read_text() == "years of work"
 
 
-@pytest.mark.full
-def test_a_mesh_that_violates_a_requirement_is_a_mesh(job, tmp_path):
-    """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1."""
+def test_a_mesh_that_violates_a_requirement_is_a_mesh(task, tmp_path):
+    """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1. Warnings are in its log."""
     inside = np.zeros((24, 24, 24))
     inside[4:20, 4:20, 11:13] = inside[11:13, 4:20, 4:20] = 1.0
     tetopt.save_image(tmp_path / "thin.nii.gz", tetopt.Image(100.0 * inside + np.arange(24.0)))
     tetopt.save_image(tmp_path / "mask.nii.gz", tetopt.Image(inside))
-    words = (f"--mask={tmp_path}/mask.nii.gz", *WORDS, str(tmp_path / "thin.nii.gz"))
-    ended = run_subject(job._replace(words=words))
+    thin = {"images": [tmp_path / "thin.nii.gz"], "mask": tmp_path / "mask.nii.gz"}
+    ended = run_subject(with_options(task, **thin))
     assert ended.status == "violated"
     assert "overlap with a Dice of only" in ended.reason
-    assert subject_folder(tmp_path / "out", "sub-1").is_dir()
-    assert not failure_path(tmp_path / "out", "sub-1").exists()
+    assert ended.reason == "; ".join(numbers_in(numbers_path(task.out, "sub-1"))["violated"].values())
+    assert "overlap with a Dice of only" in log_path(task.out, "sub-1").read_text()
 
 
-@pytest.mark.parametrize(("text", "reason"), [
-    ("tetopt: a.nii: too short\ntetopt: warning: slow\nTraceback\n", "a.nii: too short"),
-    ("one\nlast words\n\n", "last words"), ("", "ended with exit code 2 and no message"),
+@pytest.mark.parametrize(("error", "reason"), [
+    (KeyError("first\nlast\x1b[2J"), "KeyError: 'first\\nlast\\x1b[2J'"),
+    (FileNotFoundError(2, "No such file", "a.nii"), "a.nii: No such file"), (InputError("a: b\n c"), "a: b c"),
+    (MemoryError("of 3 GB"), "not enough memory: of 3 GB; use fewer nodes, a part of the image or `max_gb`"),
 ])  # fmt: skip
-def test_the_reason_is_the_last_line_that_says_one(tmp_path, text, reason):
-    (tmp_path / "a.log").write_text(text)
-    assert _reason(tmp_path / "a.log", 2) == reason
+def test_an_error_is_a_line_and_one_of_a_programmer_a_traceback_in_the_log(task, monkeypatch, error, reason):
+    def failing(job, on, _):
+        warnings.warn("half of it is empty", stacklevel=1)
+        raise error
+
+    monkeypatch.setattr(run_module, "run", failing)
+    assert run_subject(task)[:3] == ("sub-1", "failed", reason)
+    log = log_path(task.out, "sub-1").read_text()
+    assert ("Traceback" in log) == isinstance(error, KeyError)
+    assert "half of it is empty" in log
+    assert not [each for each in (task.out / ".work").iterdir() if each.is_dir()]
 
 
-def processes_of(folder):
-    """The runs of a cohort's folder that are under way."""
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            words = process.cmdline()
-            if "mesh" in words and any(word.startswith(folder) for word in words):
-                found.append(process.pid)
-    return found
-
-
-def with_a_run_under_way(job, action):
-    """How a long run ends with which something is done; `action` takes the process."""
-    ended = []
-    words = ("--nodes=3000", "--iterations=500", *job.words[2:])
-    runner = threading.Thread(target=lambda: ended.append(run_subject(job._replace(words=words))))
-    runner.start()
-    seen = set()
-    while runner.is_alive():
-        for process in set(processes_of(job.out)) - seen:
-            seen.add(process)
-            action(process)
-        time.sleep(0.05)
-    return ended[0], len(seen)
-
-
-@pytest.mark.deep
-def test_a_killed_run_is_repeated_once(job, tmp_path):
-    ended, n_runs = with_a_run_under_way(job, lambda process: os.kill(process, signal.SIGKILL))
-    assert n_runs == 2
-    assert ended.status == "failed"
-    assert "ended by signal 9, SIGKILL" in ended.reason
-    assert json.loads(failure_path(tmp_path / "out", "sub-1").read_text())["attempts"] == 2
-    assert not [each for each in (tmp_path / "out" / ".work").iterdir() if each.is_dir()]
-
-
-@pytest.mark.deep
-def test_a_run_that_is_given_up_ends(job, tmp_path):
+def test_a_run_that_is_given_up_ends(task, monkeypatch):
     """As when Ctrl-C has ended the cohort: workers of a cluster do not hear it."""
-    ended, n_runs = with_a_run_under_way(job, lambda _: (tmp_path / "out" / ".work" / "run-1").unlink())
-    assert (ended.status, n_runs) == ("given up", 1)
-    assert [each.name for each in (tmp_path / "out" / ".work").iterdir()] == ["tetopt-manifest"]
-    assert not processes_of(job.out)
-    assert not failure_path(tmp_path / "out", "sub-1").exists()
+
+    def run_and_clean(job, on, stop):
+        def heard(event):
+            if event.kind == "started" and event.data.name == "optimise":
+                clean(task.out)
+
+        return tetopt.run(job, heard, stop)
+
+    monkeypatch.setattr(run_module, "run", run_and_clean)
+    ended = run_subject(with_options(task, iterations=500))
+    assert (ended.status, "No such file" in ended.reason) == ("failed", True)
+    assert [each.name for each in (task.out / ".work").iterdir()] == ["tetopt-manifest"]
+    assert not subject_folder(task.out, "sub-1").exists()
 
 
-@pytest.mark.full
-@pytest.mark.parametrize(("n_bytes", "limit", "reason", "attempts"), [
-    (3e9, 2e9, "needs 3 GB of memory, but a worker has 2 GB; reduce the number of nodes", 0),
-    (0.0, 5e7, "exceeded its worker's memory limit of 50 MB; reduce the number of nodes, or use larger workers", 1),
-])  # fmt: skip
-def test_a_subject_beyond_its_workers_memory_is_a_row(job, tmp_path, monkeypatch, n_bytes, limit, reason, attempts):
-    """Not begun where that is predicted, and ended where it is measured."""
-    monkeypatch.setattr(run_module, "memory_limit", lambda: limit)
-    ended = run_subject(job._replace(n_bytes=n_bytes))
-    record = json.loads(failure_path(tmp_path / "out", "sub-1").read_text())
-    assert ended.status == "failed"
-    assert reason in ended.reason == record["reason"]
-    assert record["attempts"] == attempts
-    assert not [each for each in (tmp_path / "out" / ".work").iterdir() if each.is_dir()]
-    assert not processes_of(job.out)
+def test_a_subject_beyond_its_workers_memory_is_not_begun(task, monkeypatch):
+    monkeypatch.setattr(run_module, "memory_limit", lambda: 2e9)
+    ended = run_subject(task._replace(n_bytes=3e9))
+    words = "needs 3 GB of memory, but a worker has 2 GB; reduce the number of nodes, or use larger workers"
+    assert (ended.status, ended.reason) == ("failed", words)
 
 
-def of_four(job):
-    """One that fails, one that kills its workers, two that are done."""
-    if job.key == "sub-2":
-        raise ValueError("first\nlast\x1b[2J")
-    if job.key == "sub-3":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return Ended(job.key, "done", "", 0.0, 0)
+def test_failures_are_recorded_and_forgotten(tmp_path, monkeypatch, task):
+    """Of a subject, of its worker, and of an earlier run."""
+    names = [task._replace(key=f"sub-{k}") for k in range(3)]
+    errors = {"sub-1": None, "sub-2": WorkerEnded(2, "possibly because it exceeded its limit of 0.4 GB"), "sub-0": None}
+    ended = [run_module.Ended("sub-0", "done", "", 1.0, 1), run_module.Ended("sub-1", "failed", "cut short", 1.0, 0)]
+    failure_path(task.out, "sub-0").write_text("{}")
 
+    def run_tasks(pool, function, tasks, place):
+        assert (function, place) == (run_subject, str(task.out))
+        return zip(tasks, [*ended, None], [errors[each.key] for each in tasks], strict=True)
 
-@pytest.mark.full
-def test_of_a_cohort_one_fails_and_one_kills_its_workers_and_the_others_are_done(tmp_path, capfd):
-    out = tmp_path / "out"
-    begin(out)
-    jobs = [SubjectTask(f"sub-{k}", (), str(out), ".vtu", 1, 1.0, "run-1") for k in range(1, 5)]
-    with workers(Share(2, 1, 4e8), None, None) as pool:
-        ended = {each.key: each for each in run_all(jobs, pool, out, of_four)}
-    assert {key: each.status for key, each in ended.items()} == {
-        "sub-1": "done", "sub-2": "failed", "sub-3": "failed", "sub-4": "done"
-    }  # fmt: skip
-    records = [json.loads(failure_path(out, key).read_text()) for key in ("sub-2", "sub-3")]
-    assert [each["attempts"] for each in records] == [1, 2]
-    assert [each["reason"] for each in records] == [ended["sub-2"].reason, ended["sub-3"].reason]
-    assert ended["sub-2"].reason.startswith("ValueError: first last")
-    assert "\x1b" not in ended["sub-2"].reason
-    assert ended["sub-3"].reason == "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
-    assert capfd.readouterr() == ("", "")
+    monkeypatch.setattr(run_module, "run_tasks", run_tasks)
+    outcomes = list(run_all(names, None, task.out))
+    reason = "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
+    assert [each[:3] for each in outcomes] == [*(each[:3] for each in ended), ("sub-2", "failed", reason)]
+    records = [json.loads(failure_path(task.out, key).read_text()) for key in ("sub-1", "sub-2")]
+    assert records[0] == {"key": "sub-1", "reason": "cut short", "command": "tetopt mesh ..."}
+    assert records[1]["reason"] == reason
+    assert not failure_path(task.out, "sub-0").exists()

@@ -6,7 +6,7 @@ import pytest
 from cohorts import save_failure, save_run
 
 from tetopt.cohort.layout import begin, mesh_name, numbers_path, subject_folder
-from tetopt.cohort.state import SubjectState, differences, foreign_files, state_of
+from tetopt.cohort.state import SubjectState, differences, state_of
 
 KEY = "sub-1"
 
@@ -77,19 +77,3 @@ def test_differences_are_said_and_the_line_is_short():
     assert differences(before, many) == (
         "o0 was none, now 0; o1 was none, now 1; o2 was none, now 2; o3 was none, now 3 and 2 more"
     )
-
-
-def test_foreign_files_in_a_subjects_place(out):
-    assert foreign_files(out, KEY) is None
-    saved(out)
-    assert foreign_files(out, KEY) is None
-    (out / KEY / "ses-a").mkdir()
-    assert "has sessions, such as ses-a" in foreign_files(out, KEY)
-    (out / "sub-2" / "ses-a").mkdir(parents=True)
-    assert "has sessions" in foreign_files(out, "sub-2")
-    assert foreign_files(out, "sub-2_ses-b") is None
-    (out / "sub-3").mkdir()
-    (out / "sub-3" / "thesis.txt").touch()
-    assert "do not belong to this cohort" in foreign_files(out, "sub-3")
-    (out / "sub-4").touch()
-    assert "do not belong to this cohort" in foreign_files(out, "sub-4")

@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from tetopt.cli.console import log, print_line, show_error, show_event
+from tetopt.cli.console import in_options, log, print_line, show_error, show_event
 from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned
 from tetopt.cohort.estimate import share_for
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
@@ -98,7 +98,7 @@ class _CohortDisplay:
         elif event.kind == "started":
             self._shown.close()
         elif event.kind == "progress" and isinstance(event.data, CohortProgress):
-            self._show(event.data, escape(event.text))
+            self._show(event.data, escape(in_options(event.text)))
         elif event.kind == "progress":
             self._close(event.data)
         else:
@@ -121,7 +121,7 @@ class _CohortDisplay:
         own = [row for row in rows if row.key in keys]
         counts = Counter[str](row.status for row in own)
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
-            log.print(escape(f"{row.key}: {row.reason}"))
+            log.print(escape(in_options(f"{row.key}: {row.reason}")))
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
         print_line(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):

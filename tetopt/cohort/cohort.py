@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
+import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -14,10 +14,10 @@ from tetopt.cohort.layout import (
     WORK_NAME,
     begin,
     check_out,
+    clean,
     failure_path,
     locked,
     not_our_files,
-    restore,
 )
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
@@ -38,6 +38,7 @@ from tetopt.io.text import counted
 from tetopt.job.events import Listener, listened, note, progress, started, violated, warning
 from tetopt.job.job import in_kinds
 from tetopt.job.options import RunOptions, kinds_of, near_hint
+from tetopt.job.plan import changed
 from tetopt.system.budget import memory_words
 from tetopt.system.files import checked_output
 from tetopt.workers import SchedulerLost, check_workers, workers
@@ -197,7 +198,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
     begin(place, [plan.subjects.absolute().as_uri()])
     with locked(place, alone):
-        restore(place, alone)
+        clean(place, alone)
         # Again, as another run may have ended since.
         to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
@@ -208,7 +209,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
                 _run(plan, to_run)
         finally:  # also on Ctrl-C, to show what is done
             if plan.entries:
-                restore(place, alone)
+                clean(place, alone)
             rows = collect(place, keys)
             save_cohort_files(place, rows)
             started("collected")
@@ -219,22 +220,16 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
     """Run the subjects, and report each outcome."""
     place, cohort, estimate = plan.place.absolute(), plan.cohort, plan.estimate
-    work = place / WORK_NAME
-    alive = work / f"run-{secrets.token_hex(4)}"
-    alive.touch()
     share = share_for(len(to_run), estimate, cohort, plan.threads)
     try:
         with workers(share, cohort.scheduler, plan.threads) as pool:
             note(pool.words())
-            jobs = [_job(entry, estimate, place, plan.suffix, pool.threads, alive.name) for entry in to_run]
-            jobs.sort(key=lambda job: -job.n_bytes)  # so that no large run remains alone at the end
-            refresh, tell = _refresher(place), _teller(jobs, pool.slots())
-            try:
-                for ended in run_all(jobs, pool, alive):
-                    tell(ended)
-                    refresh()
-            finally:  # before the workers close, which then abandon their runs
-                alive.unlink(missing_ok=True)
+            tasks = [_task(entry, estimate, place, plan.suffix) for entry in to_run]
+            tasks.sort(key=lambda task: -task.n_bytes)  # so that no large run remains alone at the end
+            refresh, tell = _refresher(place), _teller(len(tasks), pool.slots())
+            for ended in run_all(tasks, pool, place):
+                tell(ended)
+                refresh()
     except SchedulerLost as lost:
         violated(f"{lost}; finished subjects are kept")
 
@@ -254,23 +249,25 @@ def _refresher(place: Path) -> Callable[[], None]:
     return refresh
 
 
-def _job(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
-    return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, estimate.get(entry.key, 0.0), run)
+def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -> SubjectTask:
+    command = shlex.join(["tetopt", "mesh", "-o", f"{entry.key}{suffix}", *entry.words()])
+    job = changed(entry.plan.bare, threads=None)  # its worker's
+    return SubjectTask(entry.key, job, suffix, place, estimate.get(entry.key, 0.0), command)
 
 
-def _teller(jobs: Sequence[SubjectTask], n_at_once: int) -> Callable[[Ended], None]:
+def _teller(n_tasks: int, n_at_once: int) -> Callable[[Ended], None]:
     """Return a function that reports a subject's outcome, and the remaining time at the pace of those that ended."""
     begun, n_done, n_failed = time.monotonic(), 0, 0
-    started("subjects", f"{counted(len(jobs), 'subject')}, {max(n_at_once, 1)} at a time", len(jobs))
+    started("subjects", f"{counted(n_tasks, 'subject')}, {max(n_at_once, 1)} at a time", n_tasks)
 
     def tell(ended: Ended) -> None:
         nonlocal n_done, n_failed
         n_done += 1
         n_failed += ended.status == "failed"
-        seconds_left = (time.monotonic() - begun) * (len(jobs) / n_done - 1.0) if n_done < len(jobs) else None
+        seconds_left = (time.monotonic() - begun) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
         what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
         memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
-        at = CohortProgress(ended, n_done, len(jobs), n_failed, seconds_left)
+        at = CohortProgress(ended, n_done, n_tasks, n_failed, seconds_left)
         progress(f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})", at)
 
     return tell

@@ -4,7 +4,7 @@ OUT/dataset_description.json                   identifies the folder as a cohort
 OUT/cohort.tsv, cohort.html                    all subjects
 OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the run's numbers in a JSON file of the same name
 OUT/sub-X[/ses-Y]/figures/                     its pictures
-OUT/logs/KEY.log, KEY.failed.json              output of the last run, and why it failed
+OUT/logs/KEY.log, KEY.failed.json              events of the last run, and why it failed
 OUT/.work/                                     unfinished outputs (`tetopt.system.work_directory`)
 """
 
@@ -25,7 +25,7 @@ from tetopt.errors import InputError
 from tetopt.system import work_directory
 from tetopt.system.files import save_json
 from tetopt.system.incoming import irregular, json_of, own_bytes, text_of
-from tetopt.system.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check_files, create, opened
+from tetopt.system.work_directory import LOCK_NAME, Layout, check_files, create, opened
 
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
@@ -33,13 +33,8 @@ TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
 OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write to OUT
 BIDS_VERSION = "1.10.0"  # of the specification that names follow
 KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
-# A subject's former outputs, with users' own files, before new ones replace them; its unfinished outputs.
-# None of these is opened, only moved or removed.
-WORK = Layout(
-    "cohort",
-    rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock|run-\w+",
-    {rf"{KEY_PATTERN.pattern}\.before": None, rf"{KEY_PATTERN.pattern}\.run-\w+\.\d+": None},
-)
+# Locks, and the unfinished outputs of subjects, which are not opened, only moved or removed.
+WORK = Layout("cohort", rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock", {rf"{KEY_PATTERN.pattern}\.run-[\w-]+": None})
 
 
 def subject_folder(out: Path, key: str) -> Path:
@@ -59,7 +54,7 @@ def numbers_path(out: Path, key: str) -> Path:
 
 
 def log_path(out: Path, key: str) -> Path:
-    """Return the path of the output of a subject's last run."""
+    """Return the path of the events of a subject's last run."""
     return out / LOGS_NAME / f"{key}.log"
 
 
@@ -113,13 +108,13 @@ def not_our_picture(out: Path, key: str) -> str | None:
 
 
 def check_place(out: Path, key: str) -> None:
-    """Raise InputError for a subject's folder that is a link, as a run replaces its content by renaming."""
+    """Raise InputError for a subject's folder that is a link, as a run would write to another place."""
     place = subject_folder(out, key)
     for each in (place, place.parent):
         if each != out and each.is_symlink():
             raise InputError(
-                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would replace its "
-                "content: move that folder back, or remove the link"
+                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would write "
+                "there: move that folder back, or remove the link"
             )
 
 
@@ -159,50 +154,30 @@ def locked(out: Path, keys: list[str] | None = None) -> AbstractContextManager[N
 
 
 def publish(work: Path, out: Path, key: str) -> None:
-    """Replace a subject's outputs by those in `work`, in one step; see `restore`."""
-    check_place(out, key)
-    place, aside = subject_folder(out, key), out / WORK_NAME / f"{key}.before"
-    place.parent.mkdir(exist_ok=True)
-    if place.exists():
-        _clear(aside, place, key)
-        os.rename(place, aside)
-    os.rename(work, place)
-    _clear(aside, place, key)
+    """Replace a subject's outputs by those in `work`; the user's own files, such as notes or results, are kept.
 
-
-def _clear(aside: Path, place: Path, key: str) -> None:
-    """Remove a subject's former outputs; the user's own files, such as notes or results of a solver, are kept."""
-    for each in aside.iterdir() if aside.exists() else ():
-        if not each.name.startswith(mesh_name(key, "")) and not (place / each.name).exists():
-            os.rename(each, place / each.name)
-    shutil.rmtree(aside, ignore_errors=True)
-
-
-def restore(out: Path, keys: list[str] | None = None) -> None:
-    """Undo a crash between the two renamings of `publish`, and remove leftovers of runs.
-
-    For these subjects, or, without `keys`, for all.
+    Its numbers are removed first and come last: a subject without them is missing, and is run again.
     """
-    with opened(out / WORK_NAME, WORK) as work:
-        for name, mode in sorted(work.own().items()):
-            if keys is not None and name.partition(".")[0] not in keys:
-                continue
-            if name.endswith(".before"):
-                _put_back(out / WORK_NAME / name, out, name.removesuffix(".before"))
-            # Removing their files (run-...) ends what a cluster still does for killed runs.
-            if stat.S_ISDIR(mode) or (keys is None and name != MANIFEST_NAME and not name.endswith(LOCK_NAME)):
-                work.remove(name, mode)
-
-
-def _put_back(aside: Path, out: Path, key: str) -> None:
-    """Restore a subject's folder, or only the user's own files if a new folder replaced it."""
     check_place(out, key)
-    place = subject_folder(out, key)
-    if place.exists():
-        _clear(aside, place, key)
-    else:
-        place.parent.mkdir(exist_ok=True)
-        os.rename(aside, place)
+    place, numbers = subject_folder(out, key), numbers_path(out, key)
+    place.mkdir(parents=True, exist_ok=True)
+    if numbers.exists():  # then the pictures are tetopt's, too
+        numbers.unlink()
+        shutil.rmtree(place / FIGURES_NAME, ignore_errors=True)
+    for path in place.glob(mesh_name(key, "*")):
+        path.unlink()
+    files = [path.relative_to(work) for path in work.rglob("*") if path.is_file()]
+    for name in sorted(files, key=lambda name: name.name == numbers.name):
+        (place / name).parent.mkdir(exist_ok=True)
+        os.replace(work / name, place / name)
+
+
+def clean(out: Path, keys: list[str] | None = None) -> None:
+    """Remove unfinished outputs of these subjects, or, without `keys`, of all: runs that go on elsewhere then end."""
+    with opened(out / WORK_NAME, WORK) as work:
+        for name, mode in work.own().items():
+            if stat.S_ISDIR(mode) and (keys is None or name.partition(".")[0] in keys):
+                work.remove(name, mode)
 
 
 def numbers_of(path: Path) -> dict[str, Any] | None:

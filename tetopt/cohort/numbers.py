@@ -44,7 +44,6 @@ SHORT_LIST = 4  # numbers of a list with a column each, as spacings and sides; l
 NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
 # First letters of texts that spreadsheets read as formulas (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-FAILURE_COLUMNS = ("attempts", "seconds", "peak_bytes", "predicted_bytes")  # from a record of `tetopt.cohort.run`
 OBLIQUE_DIGITS = 1  # of degrees: the precision of an affine's float32 numbers
 COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
 LARGEST_COUNT = 2**63  # of whole numbers: larger ones are not counts
@@ -125,9 +124,8 @@ def row_of(out: Path, key: str) -> Row:
     row = Row(key, subject, session, "missing", "not run yet", (), files, {}, {}, {}, {})
     if (path := failure_path(out, key)).exists():
         failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
-        numbers = {f"failure.{name}": _scalar(failure[name]) for name in FAILURE_COLUMNS if name in failure}
         own = {name: file for name, file in files.items() if name == "log"}  # the others belong to an older mesh
-        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), numbers=numbers, files=own)
+        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), files=own)
     if "numbers" not in files:
         return row
     run = numbers_of(places["numbers"])

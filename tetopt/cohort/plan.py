@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
+from tetopt.cohort.layout import check_place, mesh_name, not_our_files, numbers_path
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.state import SubjectState, foreign_files, state_of
+from tetopt.cohort.state import SubjectState, state_of
 from tetopt.cohort.subjects import (
     FILE_OPTIONS,
     Problems,
@@ -106,8 +106,8 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
             problems.append((subject.place, str(error)))
             continue
         problems += [(subject.place, words) for words in _missing(plan.job)]
-        if (foreign := foreign_files(out, key(subject))) is not None:
-            problems.append(("", foreign))
+        if (wrong := not_our_files(out, key(subject))) is not None:
+            problems.append(("", wrong))
         entries.append(PlannedSubject(subject, key(subject), own, plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))
@@ -148,8 +148,7 @@ class _Plans:
                 raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
             own = with_options(self._options, {name.replace("_", "-"): text for name, text in subject.options.items()})
             own = replace(own, **files)
-            places: dict[str, Any] = {"output": self._output, "figures": Path(FIGURES_NAME)}
-            self._known[kind] = own, resolved(JobOptions(images=list(subject.images), **places, **vars(own)))
+            self._known[kind] = own, resolved(JobOptions(images=list(subject.images), output=self._output, **vars(own)))
         own, plan = self._known[kind]
         return replace(own, **files), plan.with_files(subject.images, files)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from tetopt.cohort.layout import failure_path, mesh_name, not_our_files, numbers_of, numbers_path, subject_folder
+from tetopt.cohort.layout import failure_path, mesh_name, numbers_of, numbers_path, subject_folder
 from tetopt.cohort.subjects import IMAGE_PATTERN
 
 Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": the mesh violates a requirement
@@ -68,18 +68,3 @@ def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
         words.append(f"tetopt was {before.get('tetopt', 'none')}, now {now['tetopt']}")
     more = f" and {len(words) - WORDS_LISTED} more" if len(words) > WORDS_LISTED else ""
     return "; ".join(words[:WORDS_LISTED]) + more
-
-
-def foreign_files(out: Path, key: str) -> str | None:
-    """Return the problem of a subject's folder, if its content is not a subject's of this cohort."""
-    place = subject_folder(out, key)
-    if not place.exists():
-        return None
-    if (wrong := not_our_files(out, key)) is not None:
-        return wrong
-    if numbers_path(out, key).is_file() and place.is_dir():
-        sessions = [each.name for each in place.iterdir() if each.name.startswith("ses-")]
-        return f"{place}: has sessions, such as {sessions[0]}; give the subject one" if sessions else None
-    if place.is_dir() and all(each.is_dir() and each.name.startswith("ses-") for each in place.iterdir()):
-        return f"{place}: has sessions; give the subject one" if "_" not in key and any(place.iterdir()) else None
-    return f"{place}: contains files that do not belong to this cohort; move them away"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import functools
 import hashlib
 import json
 import time
@@ -14,7 +13,6 @@ from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 import tetopt
@@ -239,10 +237,7 @@ def _runner(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iter
 
         def run(names: Sequence[str]) -> Iterator[Any]:
             places = [str(Path(name).absolute()) for name in names]  # workers elsewhere have other current folders
-            task = functools.partial(_worked_on, pool.threads)
-            for name, numbers, error in run_tasks(
-                pool, task, places, str((folder / VOLUME_NAME).absolute()), is_alone=True
-            ):
+            for name, numbers, error in run_tasks(pool, _worked_on, places, str((folder / VOLUME_NAME).absolute())):
                 if isinstance(error, WorkerEnded):
                     raise InputError(f"{plain(name)}: {error}; {MORE_MEMORY}")
                 if error is not None:
@@ -252,10 +247,8 @@ def _runner(job: JobOptions, folder: Path, n_parts: int, n_bytes: float) -> Iter
         yield run
 
 
-def _worked_on(threads: int, name: str) -> Any:
-    """Work on a part in a worker, with this number of threads."""
-    numba.config.reload_config()  # the main program may have loaded numba before dask set the environment
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+def _worked_on(name: str) -> Any:
+    """Work on a part in a worker."""
     try:
         return work_on(name)
     except MemoryError as error:

@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from math import floor, inf, log10
 from pathlib import Path
 from typing import NamedTuple
@@ -105,18 +106,24 @@ def address_bytes() -> int:
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
-def peak_bytes(pid: int | None = None) -> int:
-    """Return the peak memory of a process, by default this one; 0 if it has ended or the system does not report it.
+def peak_bytes() -> int:
+    """Return the peak memory of this process; 0 if the system does not report it.
 
     On Linux this is VmHWM, not ru_maxrss, which starts at the memory of the parent that started the process.
     """
     try:
-        status = (PROC_FOLDER / str(pid or "self") / "status").read_text(encoding="ascii", errors="replace")
+        status = (PROC_FOLDER / "self" / "status").read_text(encoding="ascii", errors="replace")
     except OSError:
         status = ""
     if (row := re.search(r"^VmHWM:\s+(\d+) kB", status, re.M)) is not None:
         return 1024 * int(row.group(1))
-    return 0 if resource is None or pid is not None else _maxrss(resource.RUSAGE_SELF)
+    return 0 if resource is None else _maxrss(resource.RUSAGE_SELF)
+
+
+def forget_peak() -> None:
+    """Lower this process's peak to its present memory, for a new task; only on Linux, proc(5)."""
+    with suppress(OSError):
+        (PROC_FOLDER / "self" / "clear_refs").write_text("5", encoding="ascii")
 
 
 def family_peak_bytes() -> int:
