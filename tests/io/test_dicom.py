@@ -384,6 +384,25 @@ def test_bits_beyond_those_stored_are_ignored(tmp_path):
     np.testing.assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048])
 
 
+def test_values_in_the_upper_bits(tmp_path):
+    """As HighBit states: 12 bits above 4 others, with a sign."""
+    data = one_slice(np.array([[-5, 7, -2048]]) * 16 + 3, ORIGIN, SliceThickness=3)
+    data.BitsStored = 12
+    with pytest.warns(UserWarning, match="HighBit is 15: the lowest 4 bits of its values are left out"):
+        image = load_image(saved(tmp_path / "a.dcm", data))
+    np.testing.assert_array_equal(image.data[:, 0, 0], [-5, 7, -2048])
+    data.HighBit = 9
+    assert_refused(saved(tmp_path / "a.dcm", data), "BitsStored 12 and HighBit 9, which contradict each other")
+
+
+def test_slices_of_two_frames_of_reference(tmp_path):
+    folder = slices_of(tmp_path / "d", RAMP[:3], FrameOfReferenceUID="1.2.5")
+    assert load_image(folder).shape == (5, 4, 3)
+    for k in (1, 2):
+        saved(folder / f"t{k}.dcm", one_slice(RAMP[k], places()[2 + k], FrameOfReferenceUID="1.2.7"))
+    assert_refused(folder, r"t1\.dcm and .*s0\.dcm have different frames of reference \(1\.2\.7 and 1\.2\.5\)")
+
+
 def test_compressed_voxels(tmp_path):
     data = enhanced(RAMP[ORDER], places()[ORDER])
     data.file_meta = FileMetaDataset()
@@ -466,9 +485,30 @@ def test_segments_by_number(tmp_path, hd, child):
         assert_segments(load_image(path), (voxels * NUMBERS).max(axis=-1))
 
 
+@pytest.mark.parametrize("shape", [(5, 7), (3, 9), (6, 6), (181, 217)])
+def test_bits_of_frames_follow_each_other(tmp_path, hd, shape):
+    """Frames that begin and end within a byte, in another order than they lie."""
+    voxels = np.random.default_rng(0).integers(0, 2, (6, *shape, 3))
+    path = segmentation(hd, tmp_path / "a.dcm", voxels.astype(bool))
+    with pytest.warns(UserWarning, match="segments overlap"):
+        assert_placed(load_image(path), (voxels * NUMBERS).max(axis=-1))
+    data = pydicom.dcmread(path)
+    data.PixelData = data.PixelData[: -(-18 * shape[0] * shape[1] // 8) - 2]
+    assert_refused(saved(path, data), "truncated or damaged")
+
+
 def test_label_map_of_segments(tmp_path, hd):
+    """Padding is background; values without a segment are told."""
     labels = (blobs() * NUMBERS).max(axis=-1)
-    assert_segments(load_image(segmentation(hd, tmp_path / "a.dcm", labels.astype(np.uint8), "LABELMAP")), labels)
+    path = segmentation(hd, tmp_path / "a.dcm", labels.astype(np.uint8), "LABELMAP")
+    assert_segments(load_image(path), labels)
+    data = pydicom.dcmread(path)
+    data.PixelData = data.PixelData.replace(b"\0", b"\xff")
+    data.PixelPaddingValue = 255
+    assert_segments(load_image(saved(path, data)), labels)
+    del data.PixelPaddingValue
+    with pytest.warns(UserWarning, match=r"voxels have values of no segment \(\[255\]\) and get label 0"):
+        assert_segments(load_image(saved(path, data)), labels)
 
 
 def test_fractions_of_segments(tmp_path, hd):
@@ -510,12 +550,18 @@ def test_segments_that_are_no_volume(tmp_path, hd):
     def nameless(data, where):
         data.SegmentSequence = data.SegmentSequence[:2]
 
+    def doubled(data, where):
+        data.SegmentSequence[2].SegmentNumber = 1
+
     for edit, match in (
         (uneven, "not at multiples of one distance"),
         (twice, "frame 1 of the file .*one segment and position"),
         (nameless, "frame 5 of the file states no segment"),
+        (doubled, 'two segments 1, "liver" and "tumour"'),
     ):
         assert_refused(edited(hd, tmp_path / "a.dcm", edit), match)
+    with pytest.raises(InputError, match="two segments 1"):
+        load_label_table(tmp_path / "a.dcm")
 
 
 def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
@@ -524,6 +570,13 @@ def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
 
     with pytest.warns(UserWarning, match="1.5 mm apart as it states, but its frames 3 mm"):
         assert load_image(edited(hd, tmp_path / "a.dcm", half)).shape == (7, 8, 13)
+
+    def thin(data, where):
+        del data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices
+        data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SliceThickness = STEP / 2
+
+    with pytest.warns(UserWarning, match="3 mm apart by their positions, which are used; SliceThickness is 1.5 mm"):
+        assert load_image(edited(hd, tmp_path / "a.dcm", thin)).shape == (7, 8, 7)
 
 
 def test_frames_of_segments_that_lie_far_apart(tmp_path, hd):

@@ -150,7 +150,9 @@ def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64
         raise InputError(f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}")
     for file in files:
         _check_voxels(file, notes)
+        _check_bits(file, notes)
     _check_sizes(files)
+    _check_world(files)
     frames = _one_volume([frame for file in files for frame in _frames(file, notes)], volume)
     grid = _placed(frames, notes, is_sparse=is_segmentation)
     shape = (grid.n_slices, *files[0].size[::-1])
@@ -163,12 +165,28 @@ def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
     """Return number, name and colour of each segment; a name that several segments have gets their numbers."""
     rows = []
     for file in _series(Path(path), []):
-        for segment in file.tags.get("SegmentSequence") or ():
+        for number, segment in _segments(file).items():
             lab = segment.get("RecommendedDisplayCIELabValue")
-            name = plain(one_line(segment.get("SegmentLabel") or segment.get("SegmentDescription") or ""))
-            rows.append((int(segment.SegmentNumber), name, [] if lab is None else _srgb([int(part) for part in lab])))
+            rows.append((number, _name(segment), [] if lab is None else _srgb([int(part) for part in lab])))
     count = Counter(name for _, name, _ in rows)
     return [(number, name if count[name] == 1 or not name else f"{name} {number}", tone) for number, name, tone in rows]
+
+
+def _segments(file: DicomFile) -> dict[int, Any]:
+    """Return what a file states of each segment, by number."""
+    segments: dict[int, Any] = {}
+    for each in file.tags.get("SegmentSequence") or ():
+        first = segments.setdefault(int(each.SegmentNumber), each)
+        if first is not each:
+            raise InputError(
+                f'{file.name} has two segments {each.SegmentNumber}, "{_name(first)}" and "{_name(each)}"; export it '
+                "again"
+            )
+    return segments
+
+
+def _name(segment: Any) -> str:
+    return plain(one_line(segment.get("SegmentLabel") or segment.get("SegmentDescription") or ""))
 
 
 def _srgb(lab: Sequence[int]) -> list[float]:
@@ -302,7 +320,9 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
         n_bytes = max(len(tags[keyword].value) for keyword in VOXELS if keyword in tags)
         columns, rows = file.size
         least = (
-            8 * file.n_frames if syntax.is_compressed else file.n_frames * rows * columns * int(tags.BitsAllocated) // 8
+            8 * file.n_frames
+            if syntax.is_compressed
+            else -(-file.n_frames * rows * columns * int(tags.BitsAllocated) // 8)
         )
         if not min(columns, rows, n_bytes) > 0 or least > n_bytes:
             raise InputError(
@@ -313,6 +333,21 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
             "more bytes of voxels than its header declares: the rest is ignored; check Rows, Columns, NumberOfFrames"
         )
         if not syntax.is_compressed and n_bytes > least + 2 and words not in notes:  # one or two may be padding
+            notes.append(words)
+
+
+def _check_bits(file: DicomFile, notes: list[str]) -> None:
+    """Raise InputError unless the highest bit of values fits their number of bits; note lower bits that are left."""
+    with _errors_of(file.name):
+        low, tags = _low_bits(file), file.tags
+        is_compressed = tags.file_meta.TransferSyntaxUID.is_compressed
+        if low < 0 or (low and (is_compressed or int(tags.HighBit) >= int(tags.BitsAllocated))):
+            raise InputError(
+                f"{file.name} states BitsAllocated {tags.BitsAllocated}, BitsStored {tags.BitsStored} and HighBit "
+                f"{tags.HighBit}, which contradict each other; export it again"
+            )
+        words = f"its HighBit is {tags.get('HighBit')}: the lowest {low} bits of its values are left out"
+        if low and words not in notes:
             notes.append(words)
 
 
@@ -327,6 +362,20 @@ def _check_sizes(files: list[DicomFile]) -> None:
                 f"{file.name} has {here} pixels, and {count} others of its series have {there} (is it a localizer?); "
                 "move it out of the folder"
             )
+
+
+def _check_world(files: list[DicomFile]) -> None:
+    """Raise InputError for files whose positions are in different frames of reference."""
+    stated: dict[str, DicomFile] = {}
+    for file in files:
+        if uid := plain(str(file.tags.get("FrameOfReferenceUID") or "")):
+            stated.setdefault(uid, file)
+    if len(stated) > 1:
+        (one, first), (other, second) = list(stated.items())[:2]
+        raise InputError(
+            f"{second.name} and {first.name} have different frames of reference ({other} and {one}): the patient was "
+            "moved between them; put the slices of one into a separate folder"
+        )
 
 
 # Frames
@@ -579,6 +628,12 @@ def _check_step(step: NDArray[np.float64], normal: NDArray[np.float64], frames: 
             f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; SpacingBetweenSlices is "
             f"{stated:.4g} mm"
         )
+    thickness = frames[0].thickness
+    if frames[0].file.is_segmentation and not stated and 0.0 < thickness * (1.0 + _UNEVEN_FRACTION) < lengths[0]:
+        notes.append(
+            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; SliceThickness is "
+            f"{thickness:.4g} mm, so slices between them may be missing"
+        )
 
 
 def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
@@ -604,15 +659,36 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
     from pydicom.pixels import iter_pixels
 
     file, indices = frames[0].file, [frame.number for frame in frames]
+    if int(file.tags.BitsAllocated) == 1 and not file.tags.file_meta.TransferSyntaxUID.is_compressed:
+        yield from _unpacked(file, indices)
+        return
+    if low := _low_bits(file):  # pydicom takes the highest bit to be that of the number of bits
+        file.tags.BitsStored += low
     is_all = indices == list(range(file.n_frames))  # read in one go
     options: dict[str, Any] = {"raw": True, "allow_excess_frames": False}
     count = 0
     with _errors_of(file.name):
         for plane in iter_pixels(file.tags, indices=None if is_all else indices, **options):
-            yield plane
+            yield plane >> low if low else plane
             count += 1
     if count < len(frames):
         raise InputError(f"{file.name} is truncated or damaged: {count} of its frames are complete; copy it again")
+
+
+def _unpacked(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
+    """Yield frames of single bits, which follow each other without padding; pydicom reads bytes too few for some."""
+    columns, rows = file.size
+    packed, size = np.frombuffer(file.tags.PixelData, np.uint8), rows * columns
+    for index in indices:
+        first, end = index * size, (index + 1) * size
+        bits = np.unpackbits(packed[first // 8 : -(-end // 8)], bitorder="little")
+        yield bits[first % 8 :][:size].reshape(rows, columns)
+
+
+def _low_bits(file: DicomFile) -> int:
+    """Return the number of bits below the values."""
+    tags = file.tags
+    return int(tags.HighBit) + 1 - int(tags.BitsStored) if "HighBit" in tags and "BitsStored" in tags else 0
 
 
 def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
@@ -643,7 +719,7 @@ def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int]
     tags = frames[0].file.tags
     order = np.lexsort([np.array([frame.segment for frame in frames]), grid.slices])
     frames, slices = [frames[k] for k in order], grid.slices[order]
-    names = {int(each.SegmentNumber): plain(one_line(each.get("SegmentLabel") or "")) for each in tags.SegmentSequence}
+    names = {number: _name(each) for number, each in _segments(frames[0].file).items()}
     for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
         if (one.segment, k) == (other.segment, before):
             raise InputError(f"{one.name} and {other.name} have one segment and position; export it again")
@@ -651,6 +727,7 @@ def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int]
     if tags.get("SegmentationType") == "LABELMAP":
         for k, plane in zip(slices, _planes(frames), strict=True):
             data[k] = plane
+        _clear(data, {0, int(tags.get("PixelPaddingValue") or 0)}, names, notes)
         return data
     if unnamed := next((frame for frame in frames if frame.segment not in names), None):
         raise InputError(f"{unnamed.name} states no segment of the file; export it again")
@@ -659,6 +736,15 @@ def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int]
         whole = int(tags.MaximumFractionalValue)
         notes.append(f"its segments are fractions: voxels belong to the largest, if it is {SEGMENT_FRACTION:g} or more")
     return _labelled(frames, slices, data, whole, names, notes)
+
+
+def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[str]) -> None:
+    """Set voxels `outside` of all segments to 0, and those of other values without a segment, which are noted."""
+    values, counts = np.unique(data, return_counts=True)
+    unknown = {k: n for k, n in zip(values.tolist(), counts.tolist(), strict=True) if k not in outside | names.keys()}
+    if unknown:
+        notes.append(f"{sum(unknown.values())} voxels have values of no segment ({list(unknown)[:8]}) and get label 0")
+    data[np.isin(data, [*outside, *unknown])] = 0
 
 
 def _labelled(
