@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from io import BytesIO
 from pathlib import Path
 
 import numba
@@ -15,6 +16,7 @@ from hypothesis import settings
 from order import LONGEST_FILES
 
 import tetopt.system.files
+from tetopt.io import apart
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
@@ -84,15 +86,29 @@ def scheduler():
         yield cluster.scheduler_address
 
 
-@pytest.fixture(scope="module")
-def read_here():
-    """Meshes are read in this process: the child of each takes a third of a second, and `tests/io` sees it at work."""
+@pytest.fixture(autouse=True)
+def read_here(monkeypatch, request):
+    """Files are read in this process, where a test is not of the child that reads them, which takes half a second.
 
-    def read_in_place(read, path, *rest, **_):
-        with warnings.catch_warnings(action="ignore"):  # which nobody hears in a child
-            return read(str(path), *rest)
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("read_vtk", "read_gmsh", "frd"):
-            patch.setattr(f"tetopt.io.{name}.read_apart", read_in_place)
+    Marked `apart`, or with the fixture `assert_refused`, are tests of the child, and of files at which libraries may
+    end the process.
+    """
+    is_apart = any(request.node.get_closest_marker(name) for name in ("apart", "deep", "slow"))
+    if is_apart or "assert_refused" in request.fixturenames:
         yield
+        return
+
+    def answered(job, _seconds):
+        stream = BytesIO()
+        with warnings.catch_warnings(action="ignore"):  # which nobody hears in a child
+            apart._sent(stream, apart._answer(job))
+        stream.seek(0)
+        return apart._received(stream), 0
+
+    monkeypatch.setattr(apart, "_of_child", answered)
+    monkeypatch.setattr(apart, "limit_self", lambda *_: None)
+    vtk = sys.modules.get("vtkmodules.vtkCommonCore")  # its readers' words go where they went before
+    window = None if vtk is None else vtk.vtkOutputWindow.GetInstance()
+    yield
+    if window is not None:
+        vtk.vtkOutputWindow.SetInstance(window)

@@ -35,7 +35,7 @@ from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 OBLIQUE_TOML = """
 name = "oblique"
 description = "A sphere of 9 mm off the middle of thick, oblique, sheared, flipped slices"

@@ -21,7 +21,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.model.averages import cell_young
 from tetopt.model.loads import parse_load
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 MAPPING = "1 + h/7"
 
 

@@ -16,7 +16,7 @@ import tetopt
 from tetopt.cli import run as cli_run
 from tetopt.model.sets import nodes_of
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from tetopt.io.formats import save_model
 from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 STEP_2 = ["2/traction:left:0.1,0,0", "2/spring:right:0.4", "2/gravity:0,0,-9810"]
 LOADS = ["hold:superior", "1/pressure:inferior:0.3", *STEP_2]

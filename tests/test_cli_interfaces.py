@@ -9,7 +9,7 @@ from commands import exit_code, numbers_in
 import tetopt
 from tetopt.measure.fidelity import cell_labels
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 
 def block_mesh(labels):

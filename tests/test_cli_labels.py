@@ -13,7 +13,7 @@ import tetopt
 from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE, hex_colour
 from tetopt.job.model import MANY_INTERFACES
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}

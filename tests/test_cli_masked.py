@@ -8,7 +8,7 @@ import tetopt
 from tetopt.model.file import MASK_TEXT
 from tetopt.report import figures
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 LAW = "4 + 0.02*max(h,-190)"  # 0.2 in the air around, 10 to 26 in the organ
 
 

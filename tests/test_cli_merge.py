@@ -8,7 +8,7 @@ from commands import exit_code, numbers_in
 
 import tetopt
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 NESTED = np.array([[2, 3, 24, 24], [41, 42, 24, 0], [16, 85, 24, 0], [502, 515, 516, 0]])
 

@@ -12,7 +12,7 @@ from results import FOLDER, our_displacement, solved_model
 import tetopt
 from tetopt.io.abaqus import input_sets
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 
 @pytest.fixture(params=[1, 2])

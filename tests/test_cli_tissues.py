@@ -10,7 +10,7 @@ from shapes import distance
 
 import tetopt
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 SHAPE = (16, 16, 16)
 R = distance(SHAPE, 7.3, 7.6, 7.2)

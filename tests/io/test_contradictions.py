@@ -40,8 +40,6 @@ def mha(folder, fields, data=VOXELS):
     return folder / "a.mha"
 
 
-pytestmark = pytest.mark.usefixtures("here")
-
 # Units
 
 

@@ -11,7 +11,6 @@ from commands import exit_code
 
 import tetopt
 from tetopt.errors import InputError
-from tetopt.io import read_dicom
 from tetopt.io.images import load_image
 from tetopt.io.label_tables import load_label_table
 
@@ -25,18 +24,6 @@ NORMAL = np.cross(*AXES)
 AXIAL = [1, 0, 0, 0, 1, 0]
 ORIGIN, BETWEEN_ROWS, BETWEEN_COLUMNS, STEP = np.array([10.0, -20.0, 30.0]), 0.5, 0.75, 3.0
 RAMP = np.arange(6 * 4 * 5, dtype=np.int16).reshape(6, 4, 5)  # slices, rows, columns: every voxel another value
-
-
-@pytest.fixture(autouse=True)
-def in_place(monkeypatch, request):
-    """Files are read in this process, but for tests of the child: it takes a second."""
-    if "child" not in request.fixturenames:
-        monkeypatch.setattr(read_dicom, "read_apart", lambda read, path, *rest, **_: read(str(path), *rest))
-
-
-@pytest.fixture
-def child():
-    """Files are read in a child process."""
 
 
 def tagged(**tags):
@@ -128,7 +115,8 @@ def assert_refused(path, match, **options):
 ORDER = np.array([3, 0, 5, 1, 4, 2])
 
 
-def test_frames_in_any_order(tmp_path, child):
+@pytest.mark.apart
+def test_frames_in_any_order(tmp_path):
     """The reader sorts them; rows and columns have spacings of their own, and the world is oblique."""
     assert_placed(load_image(saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER]))))
 
@@ -476,7 +464,8 @@ def assert_segments(image, labels):
 NUMBERS = np.array([1, 2, 3])
 
 
-def test_segments_by_number(tmp_path, hd, child):
+@pytest.mark.apart
+def test_segments_by_number(tmp_path, hd):
     """Empty slices between frames stay empty; of overlapping segments, the larger number is kept, and told."""
     voxels = blobs()
     path = segmentation(hd, tmp_path / "a.dcm", voxels)

@@ -27,7 +27,6 @@ from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.sets import Sets
 
-pytestmark = pytest.mark.usefixtures("here")
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 1, 2, 3]])
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [

@@ -14,7 +14,6 @@ from tetopt import InputError, Mesh
 from tetopt.geometry.quadratic import quadratic
 from tetopt.io.frd import read_frd
 
-pytestmark = pytest.mark.usefixtures("here")
 PRINTED = 6e-6  # half a unit of the sixth digit, which is the last that CalculiX writes
 
 

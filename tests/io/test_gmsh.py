@@ -33,7 +33,6 @@ from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
 from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples
 
-pytestmark = pytest.mark.usefixtures("here")
 WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
 NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10}

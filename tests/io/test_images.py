@@ -353,6 +353,7 @@ def test_complex_metaimage_is_refused(tmp_path, sitk):
     assert_refused(path, "got complex ones|one number per voxel, got 2")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", ["ct_lung_small.mha", "prostate_phantom_subvolume.nrrd"])
 @pytest.mark.usefixtures("sitk")
 def test_truncated_itk_file(data_dir, tmp_path, name):
@@ -361,6 +362,7 @@ def test_truncated_itk_file(data_dir, tmp_path, name):
     assert_refused(path, DAMAGED)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("suffix", [".nrrd", ".nhdr", ".mha", ".mhd", ".dcm"])
 @pytest.mark.usefixtures("sitk")
 def test_garbage_itk_file(tmp_path, suffix):
@@ -478,6 +480,7 @@ def test_dicom_slices_that_are_not_parallel(tmp_path, sitk):
     assert_refused(tmp_path / "d", "not parallel")
 
 
+@pytest.mark.apart
 def test_damaged_dicom_slice_is_not_passed_over(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4))
     last = tmp_path / "d" / "1.2.3.4_10.dcm"  # slice 3
@@ -587,6 +590,7 @@ def test_frames_of_a_tiff(tmp_path):
     assert_refused(path, "got 3: the file has 3 volumes", volume=3)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.jpg", "a.bmp"])
 def test_truncated_picture(tmp_path, name):
     rows = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
@@ -624,6 +628,7 @@ def test_empty_file(tmp_path, suffix):
     assert_refused(path, "the file is empty")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("suffix", [".nii", ".mgh", ".png", ".tif", ".jpg", ".bmp"])
 def test_garbage(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"

@@ -20,7 +20,6 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.sets import MOST_LETTERS
 from tetopt.start.lattice import lattice_mesh
 
-pytestmark = pytest.mark.usefixtures("here")
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
 ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}
 FIELDS = ["mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"]

@@ -11,7 +11,6 @@ from tetopt.io.images import load_image
 from tetopt.io.label_tables import load_label_table
 
 sitk = pytest.importorskip("SimpleITK")
-pytestmark = pytest.mark.usefixtures("here")
 
 HEAD = (
     "NRRD0004\ntype: uint8\ndimension: 4\nspace: left-posterior-superior\nsizes: {sizes}\nspace directions: none "

@@ -9,7 +9,6 @@ from tetopt.errors import InputError
 from tetopt.io.images import load_image
 
 tifffile = pytest.importorskip("tifffile")
-pytestmark = pytest.mark.usefixtures("here")
 VOXELS = np.arange(10 * 5 * 7, dtype=np.uint16).reshape(10, 5, 7)  # slices, rows, columns
 
 

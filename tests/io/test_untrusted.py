@@ -28,6 +28,8 @@ from tetopt.model.mappings import load_mapping
 from tetopt.system import budget, incoming
 from tetopt.system.incoming import json_of, text_of, toml_of
 
+pytestmark = pytest.mark.apart
+
 POINTS = struct.pack("<12d", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
 PACKED = zlib.compress(POINTS)
 

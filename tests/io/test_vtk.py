@@ -16,8 +16,6 @@ from tetopt.io.vtk import model_grid, vtu
 from tetopt.model.loads import load_words
 from tetopt.model.sets import nodes_of
 
-pytestmark = pytest.mark.usefixtures("here")
-
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])  # a slice has a plane of its own

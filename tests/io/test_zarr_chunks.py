@@ -18,7 +18,10 @@ from tetopt.io.stored_images import open_stored
 VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
 PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
 LINE = "its voxels .* cannot be read|zarr crashed|more than 2.1 GB of memory"
-pytestmark = pytest.mark.filterwarnings("ignore")  # of sizes of boxes, and codecs that Zarr 3 has not specified
+pytestmark = [
+    pytest.mark.apart,
+    pytest.mark.filterwarnings("ignore"),
+]  # of sizes of boxes, and codecs that Zarr 3 has not specified
 
 
 def packer(name):

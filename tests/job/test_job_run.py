@@ -13,7 +13,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.job.events import listened, note
 from tetopt.job.source import Source
 
-pytestmark = [pytest.mark.full, pytest.mark.usefixtures("read_here")]
+pytestmark = pytest.mark.full
 
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
 OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}

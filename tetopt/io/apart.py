@@ -71,6 +71,22 @@ def read_apart(
     name = f"{read.__module__}:{read.__qualname__}"
     job = {"read": name, "path": str(path), "rest": rest, "bytes": most_bytes, "seconds": int(seconds)}
     deadline = time.monotonic() + seconds
+    answer, code = _of_child(job, seconds)
+    if answer is None:
+        if time.monotonic() >= deadline or code == -getattr(signal, "SIGXCPU", 0):
+            raise InputError(f"{library} did not read it within {seconds:.0f} s; it may be damaged or malicious")
+        ending = (signal_words(code) or f"exit code {code}").rpartition(", ")[2]
+        raise InputError(
+            f"{library} crashed on this file ({ending}; memory limit {most_bytes / 1e9:.1f} GB); "
+            "the file is damaged: copy or export it again"
+        )
+    if "refused" in answer:
+        raise InputError(answer["refused"])
+    return answer["value"]
+
+
+def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | None, int]:
+    """Return the answer of a child, None if it is incomplete, and its exit code; kill it after some seconds."""
     with started(
         python_command("-m", "tetopt.io.apart"),
         python_environment(),
@@ -87,19 +103,7 @@ def read_apart(
             with contextlib.suppress(BrokenPipeError):  # it ended early; its exit code tells why
                 child.stdin.write(json.dumps(job).encode())
                 child.stdin.close()
-            answer = _received(child.stdout)
-            code = child.wait()
-    if answer is None:
-        if time.monotonic() >= deadline or code == -getattr(signal, "SIGXCPU", 0):
-            raise InputError(f"{library} did not read it within {seconds:.0f} s; it may be damaged or malicious")
-        ending = (signal_words(code) or f"exit code {code}").rpartition(", ")[2]
-        raise InputError(
-            f"{library} crashed on this file ({ending}; memory limit {most_bytes / 1e9:.1f} GB); "
-            "the file is damaged: copy or export it again"
-        )
-    if "refused" in answer:
-        raise InputError(answer["refused"])
-    return answer["value"]
+            return _received(child.stdout), child.wait()
 
 
 # The answer: one line of JSON, followed by the arrays that it has marks for, in order.
@@ -142,26 +146,31 @@ def _received(stream: IO[bytes]) -> dict[str, Any] | None:
 # In the child
 
 
-def main() -> None:
-    """Do the job given by standard input."""
-    stream = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)  # libraries may write anything there
-    job = json.loads(sys.stdin.buffer.read())
+def _answer(job: dict[str, Any]) -> dict[str, Any]:
+    """Read within the limits of the job; return the value, or why the file is refused."""
     module, _, name = job["read"].partition(":")
     try:
         read = getattr(importlib.import_module(module), name)
         limit_self("RLIMIT_AS", address_bytes() + job["bytes"])
         limit_self("RLIMIT_CPU", job["seconds"])
         limit_self("RLIMIT_CORE", 0)  # no core file with a patient's scan
-        answer = {"value": read(job["path"], *job["rest"])}
+        return {"value": read(job["path"], *job["rest"])}
     except InputError as error:
-        answer = {"refused": str(error)}
+        return {"refused": str(error)}
     except MemoryError:
-        answer = {"refused": f"reading it needs more than {job['bytes'] / 1e9:.1f} GB of memory; is it damaged?"}
+        return {"refused": f"reading it needs more than {job['bytes'] / 1e9:.1f} GB of memory; is it damaged?"}
     except Exception as error:  # libraries raise any error on damaged files
         words = " ".join(str(error).split())
-        answer = {"refused": f"truncated or damaged; copy it again ({type(error).__name__}: {words[:200]})"}
+        return {"refused": f"truncated or damaged; copy it again ({type(error).__name__}: {words[:200]})"}
+
+
+def main() -> None:
+    """Do the job given by standard input."""
+    stream = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)  # libraries may write anything there
+    job = json.loads(sys.stdin.buffer.read())
+    answer = _answer(job)
     with contextlib.suppress(BrokenPipeError):  # the parent has ended
         _sent(stream, answer)
         stream.close()

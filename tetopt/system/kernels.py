@@ -511,13 +511,13 @@ class _Row(NamedTuple):
 
 class _Rows(NamedTuple):
     row: _Row
-    count: int
+    length: int
 
 
 def _multiply(rows: _Rows, number: int) -> None:
     if number < 0:
         raise MemoryError
-    factors = np.full(rows.count, rows.row.factor)
+    factors = np.full(rows.length, rows.row.factor)
     rows.row.x[number] *= factors[number]
 
 
