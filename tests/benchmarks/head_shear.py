@@ -17,28 +17,10 @@ import numpy as np
 import tetopt
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.fem.elasticity import compression, elements_of
-from tetopt.fem.reference import _displacements, _places, _pushed, at_centres
-from tetopt.fem.voxels import grid_of, interpolated, solve_voxels
+from tetopt.fem.reference import _compressed, _displacements, _places, at_centres
 from tetopt.geometry.topology import facets
 
 SHEAR_FRACTION = 0.02
-
-
-def reference(modulus: tetopt.Image, nu: float, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements of the voxels' corners, and those with one modulus everywhere, (*shape + 1, 3) mm."""
-    grid = grid_of(modulus, nu)
-    half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))
-    solutions = []
-    for fine, coarse in ((grid, half), (grid._replace(young=np.ones_like(grid.young)), None)):
-        start = None
-        if coarse is not None:
-            u_coarse = _pushed(modulus, coarse, push)
-            solve_voxels(coarse, u_coarse)
-            start = interpolated(u_coarse, coarse, grid)
-        u = _pushed(modulus, fine, push, start)
-        print(f"reference: {solve_voxels(fine, u)}", flush=True)
-        solutions.append(grid.in_image(u))
-    return solutions[0], solutions[1]
 
 
 def plates(image: tetopt.Image, mesh: tetopt.Mesh, near: float) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +51,9 @@ def main() -> None:
     labels = image.data.astype(np.int64)
     modulus = tetopt.Image(of_label[labels], image.affine)
     push = np.array([SHEAR_FRACTION * image.spacing[2] * image.shape[2], 0.0, 0.0])
-    u_ref, u_even = reference(modulus, options.nu, push)
+    u_ref, work = _compressed(modulus, options.nu, push)
+    u_even, _ = _compressed(tetopt.Image(np.ones(image.shape), image.affine), options.nu, push)
+    print(f"reference: {work}", flush=True)
     is_judged = np.isin(labels.ravel(), [int(k) for k in options.judged.split(",")])
     rows = []
     for path in options.meshes:

@@ -105,6 +105,19 @@ def test_numbers_are_those_of_the_meshes(run, head):
         assert bool(median["own_interfaces"]) == bool(median["own_labels"])
 
 
+def test_the_reference_is_as_fine_as_memory_allows(monkeypatch):
+    """The default where there is room, less of it with a note where there is not."""
+    said = []
+    monkeypatch.setattr(compare, "note", said.append)
+    for free, dofs in ((10**12, 300_000), (480_000_000, 80_000), (0, 1_000)):
+        monkeypatch.setattr(compare, "available_bytes", lambda free=free: free)
+        assert compare.default_dofs() == dofs
+    assert said == [
+        "reference: 80000 instead of 300000 unknowns, as only 0.48 GB is free",
+        "reference: 1000 instead of 300000 unknowns, as only 0 MB is free",
+    ]
+
+
 def test_a_cell_without_a_label_of_its_own_has_that_of_most_voxels(head):
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     mapping, _ = compare.default_mapping(image)
@@ -243,7 +256,7 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),
         (["--max-seconds", "nan"], "--max-seconds: expected more than 0"),
-        (["--reference-seconds", "10"], "--reference-dofs already sets the size of the reference"),
+        (["--reference-dofs", "999"], "--reference-dofs: expected 1000 or more"),
         (["--young", "h-1000"], "--young: expected 0 kPa or more"),
         (["--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
     ],

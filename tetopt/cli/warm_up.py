@@ -19,7 +19,6 @@ from tetopt import (
 from tetopt.cli.console import print_line
 from tetopt.cli.run import compiling
 from tetopt.contents.content import content
-from tetopt.fem.reference import reference
 from tetopt.system.cache import place_cache
 from tetopt.system.kernels import link, roots
 
@@ -37,7 +36,6 @@ def warm_up_command() -> int:
         link(roots(), progress)
         for n in (3, 2):
             _mesh_balls(n)
-        reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)
     seconds = time.perf_counter() - begin
     print_line(f"all kernels are ready after {seconds:.0f} s, stored in {place.folder}")
     return 0

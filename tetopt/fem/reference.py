@@ -1,42 +1,30 @@
 """The reference for errors of meshes: the same compression on a grid with one element per voxel.
 
-Elements are n-linear (hexahedra; quadrilaterals of plane stress in 2-D), parallelepipeds under the image's affine, each
-with its voxel's modulus. `tetopt.fem.voxels` solves them without a matrix, on millions of voxels.
+Elements are those of `tetopt.fem.hexahedra`, each with its voxel's modulus.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product as combinations_of
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.sparse import csr_array
 
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
-from tetopt.fem.voxel_kernels import product
-from tetopt.fem.voxels import (
-    Grid,
-    Work,
-    block_means,
-    grid_of,
-    interpolated,
-    shape_gradients,
-    solve_voxels,
-    stiffness_product,
-)
+from tetopt.fem.hexahedra import Work, shape_gradients, solve_between_plates, stiffness_product
 from tetopt.geometry.box import upright_axis
 from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.budget import at_most, check_memory
 
-# Of memory per dof, for a solution and everything derived; 70 were measured at 27 million, 110 at 3 million.
-DOF_BYTES = 100
+STEP_GROWTH = 1.02  # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
 INTERFACE_BAND_VOXELS = 2.0  # distance from an interface within which its strain is compared
-SCALE_RESIDUAL = 1e-6  # for the homogeneous block, which only scales an error: 1e-3 of the smallest
 VOXELS_AT_ONCE = 2**18  # compared at a time, so that a volume of millions takes no more memory than its solution
 
 
@@ -91,35 +79,45 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     Raises
     ------
     InputError
-        A modulus that is not above 0, or nu out of range.
+        A modulus that is not above 0, nu out of range, or too little memory.
     RuntimeError
-        As for `tetopt.fem.voxels.solve_voxels`.
+        As for `tetopt.fem.elasticity.solved`.
     """
     if not (modulus.data > 0.0).all():
         raise InputError(f"modulus: expected values above 0 kPa in every voxel, got as low as {modulus.data.min():g}")
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
-    n_dofs = modulus.ndim * float(np.prod(np.array(modulus.shape) + 1))
-    what = f"reference: {n_dofs:.4g} degrees of freedom"
-    check_memory(DOF_BYTES * n_dofs, what, lambda room: f"{at_most(room / DOF_BYTES)} (`reference_dofs`)")
-    grid = grid_of(modulus, nu)
     push = push_of(modulus, percent)
-    half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))
-    u_half = _pushed(modulus, half, push)
-    solve_voxels(half, u_half)
-    u = _pushed(modulus, grid, push, interpolated(u_half, half, grid))
-    work = solve_voxels(grid, u)
-    difference = _distance(u, interpolated(u_half, half, grid))
-    energy, half_energy = (0.5 * float(product(v, stiffness_product(g, v))) for g, v in ((grid, u), (half, u_half)))
+    u, work = _compressed(modulus, nu, push)
+    half = averaged(modulus, tuple(max(1, s // 2) for s in modulus.shape))
+    u_half, _ = _compressed(half, nu, push)
     even = u
-    if grid.young.min() < grid.young.max():
-        even = _pushed(modulus, grid, push)
-        solve_voxels(grid._replace(young=np.ones_like(grid.young)), even, SCALE_RESIDUAL)
-    scale = _distance(u, even)
-    own = OwnError(
-        abs(half_energy / energy - 1.0), None if scale <= 1e-7 * _distance(u, np.zeros(len(u))) else difference / scale
-    )
-    return Reference(modulus, nu, energy, grid.in_image(u), grid.in_image(even), own, work)
+    if modulus.data.min() < modulus.data.max():
+        even, _ = _compressed(Image(np.ones(modulus.shape), modulus.affine), nu, push)
+    energy, half_energy = _strain_energy(modulus, nu, u), _strain_energy(half, nu, u_half)
+    error, scale = (_squares(u - other) for other in (interpolated(u_half, modulus.shape), even))
+    is_homogeneous = scale <= 1e-14 * _squares(u)  # only the solver's error remains
+    own = OwnError(abs(half_energy / energy - 1.0), None if is_homogeneous else float(np.sqrt(error / scale)))
+    return Reference(modulus, nu, energy, u, even, own, work)
+
+
+def _compressed(modulus: Image, nu: float, push: NDArray[np.float64]) -> tuple[NDArray[np.float64], Work]:
+    """Displacements of the nodes with the bottom pushed in and the top fixed."""
+    n, axis = modulus.ndim, upright_axis(modulus.affine)
+    u = np.zeros((*(s + 1 for s in modulus.shape), n))
+    bottom = 0 if modulus.affine[n - 1, axis] > 0.0 else -1
+    np.moveaxis(u, axis, 0)[bottom] = push
+    return u, solve_between_plates(modulus, nu, u)
+
+
+def _strain_energy(modulus: Image, nu: float, u: NDArray[np.float64]) -> float:
+    return 0.5 * float((u * stiffness_product(modulus, nu, u)).sum())
+
+
+def interpolated(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Displacements of a grid's nodes at the nodes of another grid of this shape over the same box."""
+    factors = [(new + 1) / old for new, old in zip(shape, u.shape, strict=False)]
+    return ndimage.zoom(u, [*factors, 1.0], order=1, mode="nearest")
 
 
 def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
@@ -204,8 +202,32 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
     n = image.ndim
     if len(shape) != n or any(not 1 <= c <= s for c, s in zip(shape, image.shape, strict=False)):
         raise InputError(f"averaged: expected at most {image.shape} voxels, got {shape}")
-    data = block_means(image.data.astype(np.float64), shape)
+    data = image.data.astype(np.float64)
+    for axis, (new, old) in enumerate(zip(shape, image.shape, strict=True)):
+        rows = np.moveaxis(data, axis, 0)
+        means = _fractions(new, old) @ rows.reshape(old, -1)
+        data = np.moveaxis(means.reshape(new, *rows.shape[1:]), 0, axis)
     return _over_same_box(image, data)
+
+
+def _fractions(new: int, old: int) -> csr_array:
+    """Fraction of each new voxel's length in each old one, (new, old)."""
+    ends = np.union1d(np.arange(new + 1) * old / new, np.arange(old + 1.0))
+    middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
+    row = np.minimum((middle * new / old).astype(np.int64), new - 1)
+    return csr_array((length * new / old, (row, middle.astype(np.int64))), shape=(new, old))
+
+
+def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: int) -> tuple[int, ...]:
+    """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer than the image."""
+    n = len(shape)
+    size = np.array(shape) * spacing
+    step = spacing.min()
+    while True:
+        coarse = np.clip(np.rint(size / np.maximum(step, spacing)), 1, shape).astype(int)
+        if n * np.prod(coarse + 1) <= dofs:
+            return tuple(int(c) for c in coarse)
+        step *= STEP_GROWTH
 
 
 def refined(image: Image, shape: tuple[int, ...]) -> Image:
@@ -239,21 +261,6 @@ def nearest(image: Image, grid: Image) -> Image:
     return Image(image.data[np.ix_(*places)], grid.affine)
 
 
-def _pushed(
-    image: Image, grid: Grid, push: NDArray[np.float64], start: NDArray[np.float32] | None = None
-) -> NDArray[np.float64]:
-    """Displacements with the bottom pushed in and the top fixed; between them `start`, or linear."""
-    u = np.zeros_like(grid.nodes()) if start is None else start.astype(np.float64)
-    planes = np.moveaxis(u, 1 + grid.plates, 0)
-    is_up = image.affine[image.ndim - 1, upright_axis(image.affine)] > 0.0
-    bottom, top = (0, -1) if is_up else (-1, 0)
-    if start is None:
-        planes[:] = np.linspace(*((1.0, 0.0) if is_up else (0.0, 1.0)), len(planes))[:, None, None, None]
-        u *= push[:, None, None, None]
-    planes[bottom], planes[top] = push[:, None, None], 0.0
-    return u
-
-
 def _places(
     image: Image, elements: Elements, cell: NDArray[np.int64], voxels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
@@ -283,8 +290,3 @@ def _strains(
 
 def _squares(values: NDArray[np.float64]) -> float:
     return float((values**2).sum())
-
-
-def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Euclidean distance of two fields at nodes."""
-    return float(np.sqrt(sum(_squares(one - other) for one, other in zip(a, b, strict=True))))

@@ -18,10 +18,18 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
-from tetopt.fem.budget import affordable_dofs, reference_shape
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
-from tetopt.fem.reference import Reference, averaged, compare, nearest, reference, refined
+from tetopt.fem.hexahedra import DOF_BYTES
+from tetopt.fem.reference import (
+    Reference,
+    averaged,
+    compare,
+    nearest,
+    reference,
+    reference_shape,
+    refined,
+)
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
@@ -38,6 +46,11 @@ from tetopt.study.child import Outcome, run_in_child
 from tetopt.study.compare_report import Measurement, Report, Settings, averages_of
 from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import pipelines_with
+from tetopt.system.budget import available_bytes, memory_words
+
+DEFAULT_REFERENCE_DOFS = 300_000  # 1.4 GB, and 2.5 minutes for both of `Settings.nus`
+LEAST_REFERENCE_DOFS = 1_000  # minimum, however little memory is free
+FREE_FRACTION = 0.8  # usable fraction of the free memory
 
 
 class Comparison(NamedTuple):
@@ -91,9 +104,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         As `tetopt.model.mappings.young_from` and `tetopt.fem.reference.reference`.
     """
     fine = young_image(image, mapping)
-    dofs = settings.reference_dofs
-    if dofs is None:
-        dofs = reference_dofs(image, mapping, settings)
+    dofs = settings.reference_dofs or default_dofs()
     modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
@@ -111,12 +122,13 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
     )
 
 
-def reference_dofs(image: Image, mapping: ModulusMapping, settings: Settings) -> int:
-    """Return the reference size that `reference_seconds` and the memory allow, which differs slightly between runs."""
-    budget = affordable_dofs(young_image(image, mapping), settings.nus, settings.reference_seconds, settings.percent)
-    limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
-    note(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
-    return budget.dofs
+def default_dofs() -> int:
+    """Return the size of the reference if none is set: less than the default only if too little memory is free."""
+    free = available_bytes()
+    dofs = max(LEAST_REFERENCE_DOFS, min(DEFAULT_REFERENCE_DOFS, int(FREE_FRACTION * free / DOF_BYTES)))
+    if dofs < DEFAULT_REFERENCE_DOFS:
+        note(f"reference: {dofs} instead of {DEFAULT_REFERENCE_DOFS} unknowns, as only {memory_words(free)} is free")
+    return dofs
 
 
 # Measures of one mesh.

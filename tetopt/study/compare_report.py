@@ -33,7 +33,6 @@ class Settings(NamedTuple):
     percent: float = 1.0  # of compression, of the box's height
     average: str = DEFAULT_AVERAGE  # of a cell's moduli, in addition to Eq. (2)'s mean
     reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
-    reference_seconds: float = 120.0  # time limit of the reference without `reference_dofs`, for all of `nus`
     max_seconds: float = 3600.0  # of one run of a pipeline
     max_bytes: int | None = None  # of one run, resident
 

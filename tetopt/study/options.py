@@ -55,11 +55,13 @@ class SimulationOptions:
         Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over the image's range."),
     ] = None
     average: Annotated[str, AVERAGE_OPTION] = DEFAULT_SETTINGS.average
-    reference_seconds: Annotated[
-        float | None, Option("S", "Time for the voxel reference, made as fine as this allows. Default: 120.")
-    ] = None
     reference_dofs: Annotated[
-        int | None, Option("D", "Exact number of unknowns of the reference, instead of a time.", least=1000)
+        int | None,
+        Option(
+            "D",
+            "Most unknowns of the voxel reference: 0.5 GB and a minute per 100,000. Default: 300,000, or what fits.",
+            least=1000,
+        ),
     ] = DEFAULT_SETTINGS.reference_dofs
 
 
@@ -83,16 +85,12 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
         _check_limit("max_seconds", self.max_seconds)
         _check_limit("max_gb", self.max_gb)
         parse_average(self.average)
-        if self.reference_seconds is not None and self.reference_dofs is not None:
-            raise InputError("`reference_seconds`: `reference_dofs` already sets the size of the reference; omit one")
-        _check_limit("reference_seconds", self.reference_seconds)
         programs = _programs(self.programs or [])
         names = [name.strip() for name in self.pipelines.split(",")]
         names += [each.name for each in programs if each.name not in names]
         return Settings(
             nodes=self.nodes, pipelines=tuple(names), programs=programs,
             repeats=self.repeats, classes=self.classes, k_D=self.k_D, reference_dofs=self.reference_dofs,
-            reference_seconds=self.reference_seconds or DEFAULT_SETTINGS.reference_seconds,
             average=self.average, max_seconds=self.max_seconds,
             max_bytes=None if self.max_gb is None else int(self.max_gb * BYTES_PER_GB),
         )  # fmt: skip
