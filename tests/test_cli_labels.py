@@ -56,6 +56,7 @@ def test_a_mesh_s_file_keeps_the_table(folder):
     assert list(numbers["label_table"]) == ["0", "1"]  # those that the image has
 
 
+@pytest.mark.deep
 def test_a_label_has_one_colour_in_pictures_page_and_file(folder, tmp_path):
     """Without a table of colours, and with one."""
     words = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]

@@ -67,7 +67,7 @@ def whole(tmp_path_factory, inputs):
     return load_mesh(folder / "a.vtu"), json.loads((folder / "a.json").read_text())
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, monkeypatch):
     """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
     monkeypatch.setattr(in_parts, "MOST_LOADED", 0)
@@ -104,7 +104,7 @@ def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypa
     assert exit_code(*command, "--order", 2, "--iterations", 1) == 0
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_a_run_out_of_time_goes_on(tmp_path, inputs, whole, monkeypatch, capfd):
     """It leaves the mesh of the last complete round, and the same request goes on from there, no other."""
     folder, other = tmp_path / "a.vtu.work", tmp_path / "ball.nii"

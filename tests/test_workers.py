@@ -86,7 +86,7 @@ def settings(name):
     return name, os.environ["NUMBA_NUM_THREADS"], memory_limit()
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_workers_here_have_their_threads_and_memory_and_leave_nothing(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("NUMBA_NUM_THREADS", "7")  # of the user's own, for this process
     before = processes()
@@ -125,6 +125,7 @@ def deadly(folder, n_deaths, name):
 
 
 @pytest.mark.deep
+@pytest.mark.deep
 def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 1), list("abc"))
     assert ended == {"a": "a", "b": "b", "c": "c"}
@@ -132,6 +133,7 @@ def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.deep
 @pytest.mark.deep
 def test_a_task_that_ends_its_workers_or_fails_takes_no_others_with_it(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 9), ["a", "b", "error", *"cdef"])

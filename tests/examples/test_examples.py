@@ -60,7 +60,12 @@ def test_every_program_has_its_number():
     assert sorted(NUMBERS) == PROGRAMS
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+LONGEST = ("nested_shells", "tissues_from_labels")  # half a minute; `make docs` runs all
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in PROGRAMS]
+)
 def test_program(name, tmp_path, monkeypatch, opengl):
     """Run in a folder with what lies beside it, the pictures drawn off screen."""
     names, printed = _run(name, tmp_path, monkeypatch)

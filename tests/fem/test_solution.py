@@ -555,7 +555,7 @@ print(hashlib.sha256(b"".join(each.tobytes() for each in numbers)).hexdigest(), 
 """
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_the_same_bits_on_any_number_of_blas_threads():
     """BLAS and LAPACK share long sums among threads, and round otherwise; a solution by multigrid does not."""
     results = set()

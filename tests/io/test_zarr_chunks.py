@@ -18,6 +18,7 @@ from tetopt.io.stored_images import open_stored
 VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
 PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
 LINE = "its voxels .* cannot be read|zarr crashed|more than 2.1 GB of memory"
+SLOW = pytest.mark.slow
 pytestmark = [
     pytest.mark.apart,
     pytest.mark.filterwarnings("ignore"),
@@ -67,7 +68,7 @@ def refused(path, words):
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("kind", ["2 blosc", "3 blosc", "3 shards"])
+@pytest.mark.parametrize("kind", ["2 blosc", *(pytest.param(each, marks=SLOW) for each in ("3 blosc", "3 shards"))])
 @pytest.mark.parametrize(
     ("offset", "number"),
     [(3, 0), (4, 2**31 - 1), (4, 2000), (4, 127), (4, 0), (8, 0), (8, 2**31), (12, 2**31 - 1), (12, 100_000), (12, 0)],
@@ -86,7 +87,9 @@ def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("name", PACKERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=() if each in ("blosc", "gzip") else SLOW) for each in PACKERS]
+)
 def test_chunks_that_are_cut(tmp_path, name):
     chunk = written(tmp_path / "a.zarr", 2, compressors=packer(name))
     content = chunk.read_bytes()

@@ -24,7 +24,7 @@ JOB = PipelineInput(IMAGE, None, 300, classes=2, iterations=3)
 LABELS = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_same_bits_as_in_process():
     job = JOB._replace(labels=LABELS)
     outcome = run_in_child(PIPELINES["tetopt-uniform"].function, job, max_seconds=300.0)

@@ -28,7 +28,7 @@ def run(tmp_path_factory, opengl):
     return out
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_files(run):
     assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PAPER_PICTURES}
     for name in PAPER_PICTURES:
