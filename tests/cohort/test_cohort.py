@@ -54,13 +54,14 @@ def small(tmp_path):
     return tmp_path
 
 
+@pytest.mark.full
 def test_a_cohort_from_python_is_that_of_the_command(small):
     """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
-    one = {"participants": ["01"], "iterations": 1}
+    one = {"participants": ["01"], "iterations": 0}
     assert tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, workers=1, **one) == {
         "sub-01": "done"
     }
-    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", "1", "--participant-label", "01"]
+    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", "0", "--participant-label", "01"]
     there = meshes(small)
     assert exit_code(*command) == 0
     assert meshes(small) == there
@@ -249,9 +250,7 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
 @pytest.mark.parametrize(("only_failed", "keys"), [(False, ["b", "c", "d"]), (True, ["b"])])
 def test_what_is_chosen(only_failed, keys):
     states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "violated"}
-    entries = [
-        cohort_plan.PlannedSubject(None, key, None, None, SubjectState(each, "")) for key, each in states.items()
-    ]
+    entries = [cohort_plan.PlannedSubject(None, key, None, SubjectState(each, "")) for key, each in states.items()]
     assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
 
 
@@ -309,14 +308,12 @@ def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatc
 
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
     """It is written now and then: not at each subject, and again when its time has come."""
-    place = tmp_path / "out"
-    begin(place)
-    refresh = cohort_module._refresher(place)
-    refresh()
-    assert not (place / "cohort.html").exists()
+    begin(tmp_path / "out")
+    assert list(cohort_module._with_pages("ab", tmp_path / "out")) == ["a", "b"]
+    assert not (tmp_path / "out" / "cohort.html").exists()
     monkeypatch.setattr(cohort_module, "PAGE_SECONDS", 0.0)
-    refresh()
-    assert (place / "cohort.html").exists()
+    assert list(cohort_module._with_pages("ab", tmp_path / "out")) == ["a", "b"]
+    assert (tmp_path / "out" / "cohort.html").exists()
 
 
 def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatch):

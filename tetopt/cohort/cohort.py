@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from tetopt.cohort.layout import (
     check_out,
     clean,
     failure_path,
+    linked_place,
     locked,
     not_our_files,
 )
@@ -28,7 +29,6 @@ from tetopt.cohort.plan import (
     chosen,
     entries_of,
     subjects_of,
-    with_places,
     with_states,
 )
 from tetopt.cohort.run import Ended, SubjectTask, run_all
@@ -165,7 +165,9 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
             raise Problems(problems)
         return plan
     entries = entries_of(rows, options, place, suffix)
-    to_run = with_places(chosen(entries, cohort.retry_failed), place)
+    to_run = chosen(entries, cohort.retry_failed)
+    if links := [wrong for entry in to_run if (wrong := linked_place(place, entry.key)) is not None]:
+        raise Problems(list(dict.fromkeys(links)))
     plan = plan._replace(entries=entries, to_run=to_run)
     if cohort.write_table is not None:
         write_table(cohort.write_table, [entry.row() for entry in entries])
@@ -226,27 +228,21 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
             note(pool.words())
             tasks = [_task(entry, estimate, place, plan.suffix) for entry in to_run]
             tasks.sort(key=lambda task: -task.n_bytes)  # so that no large run remains alone at the end
-            refresh, tell = _refresher(place), _teller(len(tasks), pool.slots())
-            for ended in run_all(tasks, pool, place):
+            tell = _teller(len(tasks), pool.slots())
+            for ended in _with_pages(run_all(tasks, pool, place), place):
                 tell(ended)
-                refresh()
     except SchedulerLost as lost:
         violated(f"{lost}; finished subjects are kept")
 
 
-def _refresher(place: Path) -> Callable[[], None]:
-    """Return a function that updates the table and the page from time to time."""
-    last, spent = time.monotonic(), 0.0
-
-    def refresh() -> None:
-        nonlocal last, spent
-        begun = time.monotonic()
-        if begun - last > max(PAGE_SECONDS, spent / PAGE_FRACTION):
+def _with_pages(outcomes: Iterable[Ended], place: Path) -> Iterator[Ended]:
+    """Pass outcomes on, and update the table and the page from time to time."""
+    refresh_at = time.monotonic() + PAGE_SECONDS
+    for ended in outcomes:
+        yield ended
+        if (begun := time.monotonic()) > refresh_at:
             save_cohort_files(place, collect(place))
-            last = time.monotonic()
-            spent = last - begun
-
-    return refresh
+            refresh_at = begun + max(PAGE_SECONDS, (time.monotonic() - begun) / PAGE_FRACTION)
 
 
 def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -> SubjectTask:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
 from io import StringIO
@@ -33,25 +32,20 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
     A kind has the same options and number of files; if its images have several shapes, one of each shape is read, up to
     `LIKE_READS`, and others count as the largest.
     """
-    like: dict[tuple[object, ...], dict[tuple[int, ...], float]] = {}
-    reads: Counter[tuple[object, ...]] = Counter()
-    estimate = {}
+    known: dict[object, dict[object, float | None]] = {}  # by kind and shape; None if not readable
+    shapes = {}
     for entry in entries:
         job = entry.job
         files = len(job.images), job.mask is None, job.labels is None, job.tissues is None
         kind = (*files, job.background, *(getattr(job, field.name) for field in fields(SizeOptions)))
-        known = like.setdefault(kind, {})
-        try:
-            shape = file_shape(job.images[0]) or ()
-        except InputError:  # its run will report it
-            continue
-        if shape not in known and reads[kind] < LIKE_READS:
-            reads[kind] += 1
-            if (n_bytes := _read_bytes(entry)) is not None:
-                known[shape] = n_bytes
-        if known:
-            estimate[entry.key] = known.get(shape, max(known.values()))
-    return estimate
+        with contextlib.suppress(InputError):  # its run will report it
+            shapes[entry.key] = kind, file_shape(job.images[0])
+            of_kind, shape = known.setdefault(kind, {}), shapes[entry.key][1]
+            if shape not in of_kind and len(of_kind) < LIKE_READS:
+                of_kind[shape] = _read_bytes(entry)
+    largest = {kind: max(filter(None, of_kind.values()), default=None) for kind, of_kind in known.items()}
+    bytes_ = {key: known[kind].get(shape) or largest[kind] for key, (kind, shape) in shapes.items()}
+    return {key: each for key, each in bytes_.items() if each is not None}
 
 
 def _read_bytes(entry: PlannedSubject) -> float | None:

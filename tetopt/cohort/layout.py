@@ -107,15 +107,16 @@ def not_our_picture(out: Path, key: str) -> str | None:
     return not_our_file(path)
 
 
-def check_place(out: Path, key: str) -> None:
-    """Raise InputError for a subject's folder that is a link, as a run would write to another place."""
+def linked_place(out: Path, key: str) -> str | None:
+    """Return the problem of a subject's folder that is a link, as a run would write to another place."""
     place = subject_folder(out, key)
     for each in (place, place.parent):
         if each != out and each.is_symlink():
-            raise InputError(
+            return (
                 f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would write "
                 "there: move that folder back, or remove the link"
             )
+    return None
 
 
 def is_cohort(out: Path) -> bool:
@@ -158,7 +159,8 @@ def publish(work: Path, out: Path, key: str) -> None:
 
     Its numbers are removed first and come last: a subject without them is missing, and is run again.
     """
-    check_place(out, key)
+    if (wrong := linked_place(out, key)) is not None:
+        raise InputError(wrong)
     place, numbers = subject_folder(out, key), numbers_path(out, key)
     place.mkdir(parents=True, exist_ok=True)
     if numbers.exists():  # then the pictures are tetopt's, too

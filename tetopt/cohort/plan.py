@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cohort.layout import check_place, mesh_name, not_our_files, numbers_path
+from tetopt.cohort.layout import mesh_name, not_our_files, numbers_path
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState, state_of
 from tetopt.cohort.subjects import (
@@ -36,11 +36,10 @@ from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
 
 class PlannedSubject(NamedTuple):
-    """A subject of the cohort, with all options of its run."""
+    """A subject of the cohort, with the plan of its run."""
 
     subject: Subject
     key: str
-    options: RunOptions
     plan: Plan  # of its run, as far as known without its files
     state: SubjectState
 
@@ -51,12 +50,14 @@ class PlannedSubject(NamedTuple):
 
     def row(self) -> Subject:
         """Return the subject with the files that patterns match."""
-        files = {name: path for name in FILE_OPTIONS if (path := getattr(self.options, name)) is not None}
+        files = {name: path for name in FILE_OPTIONS if (path := getattr(self.plan.bare, name)) is not None}
         return self.subject._replace(files=files)
 
     def words(self) -> tuple[str, ...]:
         """Return the arguments of `tetopt mesh`, without outputs and threads."""
-        options = {name: value for name, value in given_options(self.options).items() if name != "threads"}
+        options = given_options(self.plan.bare)
+        for name in ("images", "output", "threads"):
+            options.pop(name, None)
         return (*option_words(options), "--", *map(str, self.subject.images))
 
 
@@ -97,18 +98,20 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
         All problems of all subjects.
     """
     problems = [("", line) for line in doubled(subjects)]
-    plans = _Plans(options, suffix)
-    entries = []
+    mappings = {name: named_file(getattr(options, name) or "") for name in FILES_IN_TEXTS}
+    # A worker may have another current folder.
+    placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
+    options, entries = replace(options, **placed), []
     for subject in subjects:
         try:
-            own, plan = plans.of(subject)
+            plan = _planned(subject, options, Path(f"mesh{suffix}"))
         except InputError as error:
             problems.append((subject.place, str(error)))
             continue
         problems += [(subject.place, words) for words in _missing(plan.job)]
         if (wrong := not_our_files(out, key(subject))) is not None:
             problems.append(("", wrong))
-        entries.append(PlannedSubject(subject, key(subject), own, plan, SubjectState("missing", "")))
+        entries.append(PlannedSubject(subject, key(subject), plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))
     if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:
@@ -126,31 +129,15 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
         yield f"{own[0]}{more}: {words}" if own[0] else words
 
 
-class _Plans:
-    """Plans of subjects; shared options are checked once."""
-
-    def __init__(self, options: RunOptions, suffix: str) -> None:
-        mappings = {name: named_file(getattr(options, name) or "") for name in FILES_IN_TEXTS}
-        # A worker may have another current folder.
-        placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
-        self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")
-        self._patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
-        self._known: dict[Any, tuple[RunOptions, Plan]] = {}
-
-    def of(self, subject: Subject) -> tuple[RunOptions, Plan]:
-        """Return a subject's options with its files, and its plan; raise InputError for invalid options."""
-        files: dict[str, Any] = {
-            name: of_each(name, pattern, partial(matching, subject=subject)) for name, pattern in self._patterns.items()
-        } | subject.files
-        kind = (tuple(sorted(subject.options.items())), tuple(sorted(files)), len(subject.images))
-        if kind not in self._known:
-            if "threads" in subject.options:
-                raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
-            own = with_options(self._options, {name.replace("_", "-"): text for name, text in subject.options.items()})
-            own = replace(own, **files)
-            self._known[kind] = own, resolved(JobOptions(images=list(subject.images), output=self._output, **vars(own)))
-        own, plan = self._known[kind]
-        return replace(own, **files), plan.with_files(subject.images, files)
+def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
+    """Plan a subject with its files and options; raise InputError for invalid options."""
+    patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
+    files = {name: of_each(name, each, partial(matching, subject=subject)) for name, each in patterns.items()}
+    if "threads" in subject.options:
+        raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
+    own = with_options(options, {name.replace("_", "-"): text for name, text in subject.options.items()})
+    named: dict[str, Any] = files | subject.files
+    return resolved(JobOptions(**vars(own) | named, images=list(subject.images), output=output))
 
 
 def _missing(job: JobOptions) -> Iterator[str]:
@@ -182,19 +169,6 @@ def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[P
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(state, entries))
-
-
-def with_places(entries: list[PlannedSubject], out: Path) -> list[PlannedSubject]:
-    """Return the subjects to run; raise Problems for folders that a run cannot replace."""
-    problems = []
-    for entry in entries:
-        try:
-            check_place(out, entry.key)
-        except InputError as error:
-            problems.append(str(error))
-    if problems:
-        raise Problems(list(dict.fromkeys(problems)))
-    return entries
 
 
 def chosen(entries: Iterable[PlannedSubject], only_failed: bool) -> list[PlannedSubject]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,31 +85,6 @@ class Plan(NamedTuple):
         if self.mode == "paper":
             return options | {"n_t": job.n_t, "retessellate": job.retessellate}
         return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
-
-    def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
-        """Return the plan with other images and files, in equal number and for the same options.
-
-        Parameters
-        ----------
-        images : sequence of Path
-            Contrasts.
-        files : mapping of str to Path
-            The other files, by the names of their options.
-
-        Returns
-        -------
-        Plan
-            Nothing is checked again.
-
-        Examples
-        --------
-        >>> plan = tetopt.plan(tetopt.Job(images="brain.nii.gz", output="brain.vtu"))
-        >>> [path.name for path in plan.with_files([Path("other.nii.gz")], {}).job.images]
-        ['other.nii.gz']
-        """
-        return self._replace(
-            job=changed(self.job, images=list(images), **files), bare=changed(self.bare, images=list(images), **files)
-        )
 
 
 def kind_of(plan: Plan, ndim: int) -> str:
