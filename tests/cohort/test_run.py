@@ -122,9 +122,12 @@ def test_an_error_is_a_line_and_one_of_a_programmer_a_traceback_in_the_log(task,
 def test_a_run_that_is_given_up_ends(task, monkeypatch):
     """As when Ctrl-C has ended the cohort: workers of a cluster do not hear it."""
 
+    stages = []
+
     def run_and_clean(job, on, stop):
         def heard(event):
-            if event.kind == "started" and event.data.name == "optimise":
+            stages.extend([event.data.name] if event.kind == "started" else [])
+            if stages[-1:] == ["optimise"]:
                 clean(task.out)
 
         return tetopt.run(job, heard, stop)
@@ -132,6 +135,7 @@ def test_a_run_that_is_given_up_ends(task, monkeypatch):
     monkeypatch.setattr(run_module, "run", run_and_clean)
     ended = run_subject(with_options(task, iterations=500))
     assert (ended.status, "No such file" in ended.reason) == ("failed", True)
+    assert stages[-1] == "optimise"  # it does not go on to write
     assert [each.name for each in (task.out / ".work").iterdir()] == ["tetopt-manifest"]
     assert not subject_folder(task.out, "sub-1").exists()
 
