@@ -77,7 +77,7 @@ def test_stacks_of_no_volume(tmp_path, voxels, options, match):
 def test_truncated_stack(tmp_path):
     path = stack(tmp_path)
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match=r"a\.tif: "):
+    with pytest.raises(InputError, match=r"a\.tif: truncated or damaged; copy it again"):
         load_image(path, spacing_mm=1.0)
 
 
@@ -93,6 +93,86 @@ def test_folder_of_slices(tmp_path, suffix):
     (path / f"scan_v2_10{suffix}").unlink()
     with pytest.raises(InputError, match=f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing"):
         load_image(path, spacing_mm=0.02)
+
+
+def sliced(folder, voxels=VOXELS, **options):
+    folder.mkdir(exist_ok=True)
+    for k, plane in enumerate(voxels):
+        stack(folder, plane, f"s{k}.tif", **options)
+    return folder
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    "options", [{"photometric": "miniswhite"}, *({"extratags": [(274, 3, 1, k, True)]} for k in (2, 3, 4))]
+)
+def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
+    """Values are as stored, and the first voxel is where Orientation says."""
+    voxels = VOXELS.astype(kind)
+    images = [
+        load_image(each, spacing_mm=1)
+        for each in (stack(tmp_path, voxels, **options), sliced(tmp_path / "d", voxels, **options))
+    ]
+    right = {2: voxels[:, :, ::-1], 3: voxels[:, ::-1, ::-1], 4: voxels[:, ::-1]}.get(
+        options.get("extratags", [[0] * 4])[0][3], voxels
+    )
+    for image in images:
+        np.testing.assert_array_equal(image.data, right.T)
+    np.testing.assert_array_equal(*(image.affine for image in images))
+
+
+def test_order_of_ome_and_its_full_level(tmp_path):
+    planes = "".join(f'<TiffData IFD="{k}" FirstZ="{9 - k}" PlaneCount="1"/>' for k in range(10))
+    words = (
+        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
+        '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="7" SizeY="5" SizeZ="10" SizeC="1" SizeT="1" '
+        f'PhysicalSizeX="20" PhysicalSizeY="20" PhysicalSizeZ="20">{planes}</Pixels></Image></OME>'
+    )
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif") as writer:
+        for k, plane in enumerate(VOXELS):
+            writer.write(plane, description=words if k == 0 else None, contiguous=False, metadata=None)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.ome.tif").data, VOXELS[::-1].T)
+    with tifffile.TiffWriter(tmp_path / "b.ome.tif", ome=True) as writer:
+        writer.write(VOXELS, subifds=1, metadata={"axes": "ZYX"})
+        writer.write(VOXELS[:, ::2, ::2], subfiletype=1)
+    np.testing.assert_array_equal(load_image(tmp_path / "b.ome.tif", spacing_mm=1).data, VOXELS.T)
+
+
+def test_calibrated_values_of_imagej(tmp_path):
+    """As signed numbers of 16 bits, which ImageJ stores without a sign; a page and a folder have them, too."""
+    line = {"cf": 0, "c0": -32768.0, "c1": 2.0}
+    options = {"imagej": True, "resolution": (20, 10), "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5}}
+    path = stack(tmp_path, **options)
+    np.testing.assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
+    page = load_image(path, volume=3)
+    np.testing.assert_array_equal(page.data, 2.0 * VOXELS[3] - 32768)
+    assert page.spacing.tolist() == pytest.approx([0.1, 0.05])
+    with pytest.raises(InputError, match=r"voxels of 0\.05 x 0\.1 mm, but `spacing_mm` is 1 x 1"):
+        load_image(path, volume=3, spacing_mm=1)
+    options["metadata"].pop("axes")
+    folder = load_image(sliced(tmp_path / "d", **options))
+    np.testing.assert_array_equal(folder.data, 2.0 * VOXELS.T - 32768)
+    assert folder.spacing.tolist() == pytest.approx([0.05, 0.1, 0.5])
+    with pytest.raises(InputError, match=r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1"):
+        load_image(tmp_path / "d", spacing_mm=1)
+    stack(tmp_path / "d", VOXELS[2], "s2.tif", **options | {"resolution": (20, 20)})
+    with pytest.raises(InputError, match=r"s2\.tif: expected the pixel size and calibration of s0\.tif"):
+        load_image(tmp_path / "d")
+    options["metadata"] |= IMAGEJ | {"cf": 3}
+    with pytest.warns(UserWarning, match="calibration of them is no straight line and is not applied"):
+        np.testing.assert_array_equal(load_image(stack(tmp_path, **options)).data, VOXELS.T)
+
+
+def test_slices_written_one_by_one(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
+        for plane in VOXELS:
+            writer.write(plane)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.tif", spacing_mm=1).data, VOXELS.T)
+    with tifffile.TiffWriter(tmp_path / "b.tif") as writer:
+        for plane in VOXELS[0], VOXELS[1, :3]:
+            writer.write(plane)
+    with pytest.raises(InputError, match="expected slices of one size and type, got 5 x 7, 3 x 7"):
+        load_image(tmp_path / "b.tif", spacing_mm=1)
 
 
 def test_slices_that_differ(tmp_path):

@@ -15,6 +15,7 @@ from tetopt.system.extras import install_hint
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 # Pillow goes by content, not by name; only these formats are tried (for PostScript it would start Ghostscript).
 PICTURE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
+PHOTOMETRIC_TAG = 262  # 0 if 0 is white
 MOST_PIXELS = 2**30  # in a frame: 32,768 squared, more than any slide scanner's plain picture
 
 
@@ -46,7 +47,10 @@ def frame_of(path: str, volume: int | None) -> NDArray:
         width, height = picture.size
         if width * height > MOST_PIXELS:
             raise InputError(f"expected at most {MOST_PIXELS} pixels, got {height} x {width}; crop or resample it")
-        return _grey(np.asarray(picture), picture.mode)
+        tags = picture.tag_v2 if picture.format == "TIFF" else {}
+        is_inverted = tags.get(PHOTOMETRIC_TAG) == 0 and picture.mode in ("1", "L")  # by Pillow, in no other mode
+        values = np.asarray(picture)
+        return _grey(~values if is_inverted else values, picture.mode)
 
 
 def _grey(values: NDArray, mode: str) -> NDArray:

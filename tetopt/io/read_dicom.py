@@ -24,7 +24,7 @@ from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import notes_of_size
-from tetopt.io.volumes import UNREADABLE_FILE, check_room, one_line, volume_index
+from tetopt.io.volumes import UNREADABLE_FILE, check_room, exact_type, one_line, volume_index
 from tetopt.model.labels import LabelTable
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
@@ -40,8 +40,6 @@ WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 FIRST_TAGS = re.compile(rb"\x08\0(\0\0(UL\x04\0|\x04\0\0\0)|[\x01\x05\x08\x12-\x18]\0)")
 LISTED_OVERLAPS = 3  # pairs of segments in a message
 SEGMENT_FRACTION = 0.5  # of a voxel: from this fraction on, it belongs to a segment
-# Stored numbers of so many bits, rescaled by whole numbers up to these, are exact in float32.
-EXACT_BITS, LARGEST_SLOPE, LARGEST_INTERCEPT = 16, 64, 2**22
 VOXELS = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
 # Tags by which dimensions order frames in space, or segments; others distinguish volumes, such as echoes.
 SPATIAL_DIMENSIONS = (0x00200032, 0x00200037, 0x00209056, 0x00209057, 0x00209113, 0x00209128, 0x0062000B)
@@ -696,14 +694,7 @@ def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int],
     if any("ModalityLUTSequence" in frame.file.tags for frame in frames):
         notes.append("its values are as stored: its table of values (ModalityLUTSequence) is not applied")
     scales, bits = {frame.scale for frame in frames}, max(int(frame.file.tags.BitsAllocated) for frame in frames)
-    is_exact = bits <= EXACT_BITS and all(
-        slope == round(slope)
-        and shift == round(shift)
-        and abs(slope) <= LARGEST_SLOPE
-        and abs(shift) <= LARGEST_INTERCEPT
-        for slope, shift in scales
-    )
-    data = np.empty(shape, dtype=np.float32 if is_exact else np.float64)
+    data = np.empty(shape, dtype=exact_type(bits, scales))
     slices = dict(zip(map(id, frames), grid.slices.tolist(), strict=True))
     of_file: dict[int, list[Frame]] = {}
     for frame in frames:

@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -25,7 +25,7 @@ from tetopt.io.pictures import MOST_PIXELS, PICTURE_SUFFIXES, frame_of, read_pic
 from tetopt.io.read_dicom import is_dicom
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_unit
-from tetopt.io.volumes import UNREADABLE_FILE, check_room, one_line
+from tetopt.io.volumes import UNREADABLE_FILE, check_room, exact_type, one_line
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -33,6 +33,9 @@ TIFF_SUFFIXES = (".tif", ".tiff")
 MM_OF_RESOLUTION = {2: 25.4, 3: 10.0}  # TIFF's ResolutionUnit: inch, cm
 SCREEN_DPI = (72.0, 96.0)  # written by default, of no meaning
 MOST_CHANNELS = 7  # of an ImageJ composite; tifffile calls the slices of a plain stack channels
+IMAGEJ_LINE, IMAGEJ_NONE = "0", "20"  # numbers of ImageJ's curves from stored to calibrated values
+ORIENTATION_TAG = 274
+FLIPS = {1: (), 2: (2,), 3: (1, 2), 4: (1,)}  # axes of (slices, rows, columns) that run the other way, as in Pillow
 AXIS_WORDS = {"C": "channels", "S": "colours", "T": "time points"}
 
 
@@ -74,48 +77,86 @@ def check_spacing(spacing_mm: float | Sequence[float] | None, own: NDArray[np.fl
         )
 
 
+class Tiff(NamedTuple):
+    """What tifffile reads of a file."""
+
+    voxels: NDArray | None  # (columns, rows, slices); None for a page, which Pillow reads
+    sizes: Sequence[float | None] = (None,) * 3  # mm, along columns, rows and slices
+    is_calibrated: bool = False  # whether the sizes are more than those of a print
+    scale: Sequence[float] = (1.0, 0.0)  # slope and intercept of values
+    notes: Sequence[str] = ()
+
+
 def read_pictures(
     path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
 ) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
     """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError without a leading path."""
-    data, own, is_calibrated = None, [], False
-    is_tiff = path.name.lower().endswith(TIFF_SUFFIXES)
-    if is_tiff and volume is None and importlib.util.find_spec("tifffile") is not None:
-        data, own, is_calibrated, said = read_apart(_stack_of, path, value_bytes=MOST_PIXELS, library="tifffile")
-        notes += said
-    if data is None:
+    tiff = Tiff(None)
+    if path.name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile():
+        is_page = volume is not None
+        tiff = Tiff(*read_apart(_stack_of, path, is_page, value_bytes=MOST_PIXELS, library="tifffile"))
+    notes += tiff.notes
+    n = 2 if tiff.voxels is None else 3
+    steps = _steps(tiff, n, spacing_mm, notes)
+    if tiff.voxels is None:
         data, affine = read_picture(path, volume, notes)
-        affine[:2] *= 1.0 if spacing_mm is None else spacing_of(spacing_mm, 2)[:, None]
-        return data, affine
-    stated = np.array([np.nan if mm is None else mm for mm in own])
-    if spacing_mm is None:
-        if not is_calibrated or np.isnan(stated).any():
-            raise InputError(
-                f"this stack of {data.shape[2]} slices states no voxel size ({_sizes(stated)} mm); give it by "
-                "`spacing_mm`, mm: one number, or three"
-            )
-        return data, _affine(stated)
-    sizes = spacing_of(spacing_mm, 3)
-    if is_calibrated:
-        check_spacing(spacing_mm, stated)
-    elif (np.abs(sizes - stated) > SAME_SIZE * stated).any():
-        notes.append(f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}")
-    return data, _affine(sizes)
+        affine[:2] *= 1.0 if steps is None else steps[:, None]
+        return _scaled(data, tiff.scale), affine
+    if steps is None:
+        raise InputError(_no_sizes(f"stack of {tiff.voxels.shape[2]}", tiff))
+    return _scaled(tiff.voxels, tiff.scale), _affine(steps)
 
 
 def read_slices(
     path: Path, names: list[str], notes: list[str], spacing_mm: float | Sequence[float] | None
 ) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
     """Return data and affine of a folder of slices, in their order; InputError without a leading path."""
-    if spacing_mm is None:
-        raise InputError(
-            f"this folder of {len(names)} slices states no voxel size; give it by `spacing_mm`: one number, or three"
-        )
     series, said = _series(names)
-    notes += said
     size = sum((path / name).stat().st_size for name in series)
-    data = read_apart(_slices_of, path, series, size=size, value_bytes=MOST_PIXELS, library="Pillow")
-    return data, _affine(spacing_of(spacing_mm, 3))
+    tiff = Tiff(
+        *read_apart(
+            _slices_of, path, series, spacing_mm is not None, size=size, value_bytes=MOST_PIXELS, library="Pillow"
+        )
+    )
+    notes += [*said, *tiff.notes]
+    assert tiff.voxels is not None
+    steps = _steps(tiff, 3, spacing_mm, notes)
+    assert steps is not None
+    return _scaled(tiff.voxels, tiff.scale), _affine(steps)
+
+
+def _has_tifffile() -> bool:
+    return importlib.util.find_spec("tifffile") is not None
+
+
+def _steps(
+    tiff: Tiff, n: int, spacing_mm: float | Sequence[float] | None, notes: list[str]
+) -> NDArray[np.float64] | None:
+    """Return n voxel sizes, mm, as the file or `spacing_mm` states; None without any. InputError if they differ."""
+    stated = np.array([np.nan if mm is None else mm for mm in tiff.sizes[:n]])
+    if spacing_mm is None:
+        return None if not tiff.is_calibrated or np.isnan(stated).any() else stated
+    sizes = spacing_of(spacing_mm, n)
+    if tiff.is_calibrated:
+        check_spacing(spacing_mm, stated)
+    elif (np.abs(sizes - stated) > SAME_SIZE * stated).any():
+        notes.append(f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}")
+    return sizes
+
+
+def _no_sizes(what: str, tiff: Tiff) -> str:
+    stated = _sizes(np.array([np.nan if mm is None else mm for mm in tiff.sizes]))
+    return f"this {what} slices states no voxel size ({stated} mm); give it by `spacing_mm`, mm: one number, or three"
+
+
+def _scaled(values: NDArray, scale: Sequence[float]) -> NDArray:
+    slope, intercept = scale
+    if (slope, intercept) == (1.0, 0.0):
+        return values
+    values = values.astype(exact_type(8 * values.itemsize, [(slope, intercept)]))
+    values *= slope
+    values += intercept
+    return values
 
 
 def slice_files(path: Path) -> list[str]:
@@ -172,12 +213,18 @@ def _sizes(sizes: NDArray[np.float64]) -> str:
 # In the child
 
 
-def _slices_of(path: str, names: list[str]) -> NDArray:
-    """Return the voxels (columns, rows, slices) of pictures of one size and type."""
+def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
+    """Return the voxels of pictures of one size, type and calibration."""
     data: NDArray | None = None
+    first = Tiff(None)
     for k, name in enumerate(names):
+        file = str(Path(path) / name)
         try:
-            pixels = frame_of(str(Path(path) / name), None)
+            tiff = _stack_of(file, True) if name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile() else Tiff(None)
+            first = tiff if k == 0 else first
+            if not has_spacing and (not tiff.is_calibrated or None in tiff.sizes):
+                break
+            pixels = frame_of(file, None)
         except InputError as error:
             raise InputError(f"{plain(name)}: {error}") from error
         if data is None:
@@ -188,13 +235,18 @@ def _slices_of(path: str, names: list[str]) -> NDArray:
                 f"{plain(name)}: expected {data.shape[1]} x {data.shape[2]} pixels of {data.dtype}, as in "
                 f"{plain(names[0])}, got {pixels.shape[0]} x {pixels.shape[1]} of {pixels.dtype}"
             )
+        calibrations = [(each.scale, each.is_calibrated and each.sizes) for each in (tiff, first)]
+        if calibrations[0] != calibrations[1]:
+            raise InputError(f"{plain(name)}: expected the pixel size and calibration of {plain(names[0])}, got others")
         data[k] = pixels
-    assert data is not None
-    return data.T
+    else:
+        assert data is not None
+        return first._replace(voxels=data.T)
+    raise InputError(_no_sizes(f"folder of {len(names)}", first))
 
 
-def _stack_of(path: str) -> tuple[NDArray | None, list[float | None], bool, list[str]]:
-    """Return voxels (columns, rows, slices), voxel sizes, whether they are calibrated, and notes; None for one page."""
+def _stack_of(path: str, is_page: bool) -> Tiff:
+    """Return the voxels of a file's pages, and what the first one states; no voxels of one page, or with `is_page`."""
     import tifffile
 
     words: list[str] = []
@@ -205,45 +257,84 @@ def _stack_of(path: str) -> tuple[NDArray | None, list[float | None], bool, list
 
     logging.getLogger("tifffile").addFilter(keep)
     try:
-        # Metadata of these kinds may name other files.
-        file = tifffile.TiffFile(path, _multifile=False, is_ome=False, is_mmstack=False, is_ndtiff=False)
+        # Metadata may name other files.
+        file = tifffile.TiffFile(path, _multifile=False, is_mmstack=False, is_ndtiff=False)
     except tifffile.TiffFileError as error:
         raise InputError(f"{UNREADABLE_FILE} (tifffile: {one_line(error)[:200]})") from error
     with file:
-        series = file.series
         first = file.pages.first
+        tiff = _stated(first)
+        if is_page:
+            return tiff
+        series = file.series
         pixels = _ome_pixels(first.description)
-        if len(series) > 1:
-            shapes = ", ".join(" x ".join(map(str, each.shape)) for each in series[:4])
-            raise InputError(f"expected slices of one size and type, got {shapes}; export one stack")
         axes = {name: int(size) for name, size in zip(series[0].axes, series[0].shape, strict=True) if size > 1}
         axes |= {name: int(pixels.get(f"Size{name}", 1)) for name in "CT" if int(pixels.get(f"Size{name}", 1)) > 1}
         if len(file.pages) == 1 and set(axes) <= set("YXS") and not words and int(pixels.get("SizeZ", 1)) == 1:
-            return None, [], False, []
-        notes = []
+            return tiff
+        if words:
+            raise InputError(f"truncated or damaged; copy it again ({words[0]})")
+        # A program may write a page at a time, each as a picture of its own.
+        is_apart = {each.kind for each in series} == {"shaped"} and {each.axes for each in series} == {"YX"}
+        if len({(each.shape, each.dtype) for each in series}) > 1 or (len(series) > 1 and not is_apart):
+            shapes = ", ".join(" x ".join(map(str, each.shape)) for each in series[:4])
+            raise InputError(f"expected slices of one size and type, got {shapes}; export one stack")
+        notes = [*tiff.notes]
         is_imagej = first.description.startswith("ImageJ=")
         if is_imagej and set(axes) == set("CYX") and axes["C"] > MOST_CHANNELS and "\nspacing=" in first.description:
             notes.append(f"its {axes.pop('C')} channels have a slice spacing: they are read as slices")
         if wrong := [f"{axes[name]} {word}" for name, word in AXIS_WORDS.items() if name in axes]:
             raise InputError(f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part")
-        shape = [int(size) for size in series[0].shape if size > 1]
-        if words or len(shape) != 3 or not {"Y", "X"} <= set(axes):
-            said = words[0] if words else f"axes {series[0].axes} of {series[0].shape}"
+        shape = [int(size) for size in (len(series), *series[0].shape) if size > 1]
+        if len(shape) != 3 or not {"Y", "X"} <= set(axes):
+            said = f"axes {series[0].axes} of {series[0].shape}"
             raise InputError(f"expected a stack of slices of one size, got {said}; export it again")
-        if "SizeZ" in pixels and int(pixels["SizeZ"]) != shape[0]:
+        if pixels and series[0].kind != "ome":
             raise InputError(
-                f"expected the {pixels['SizeZ']} slices of its OME metadata, got {shape[0]}; export it again"
+                f"expected the {pixels.get('SizeZ')} slices of its OME metadata, which are in other files, or not as "
+                "it says; export it again as one file"
             )
         if first.photometric == 3 and not is_imagej:
             raise InputError("expected grey slices, got a palette of colours; convert it to grey first")
+        orientation = first.tags.get(ORIENTATION_TAG)
+        flips = FLIPS.get(1 if orientation is None else int(orientation.value))
+        if flips is None:
+            raise InputError(f"its Orientation {orientation.value} swaps rows and columns; export it upright")
         check_room(shape, series[0].dtype.itemsize)
-        data = _values(series[0]).reshape(shape)
-        if first.photometric == 0:
-            notes.append("its photometric says that 0 is white; values are kept as stored")
+        parts = [_values(each) for each in series]
+        data = (parts[0] if len(parts) == 1 else np.stack(parts)).reshape(shape)
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
-        own = _ome_sizes(pixels) if pixels else _imagej_sizes(first) if is_imagej else None
-        return data.T, own or _resolution(first), own is not None, notes
+        return tiff._replace(voxels=np.flip(data, flips).T, notes=notes)
+
+
+def _stated(page: Any) -> Tiff:
+    """Return what a page states of its voxels."""
+    notes = []
+    if page.photometric == 0:
+        notes.append("its photometric says that 0 is white; values are kept as stored")
+    fields: dict[str, str] = {}
+    for line in page.description.splitlines() if page.description.startswith("ImageJ=") else ():
+        key, _, fields[key] = line.partition("=")
+    pixels = _ome_pixels(page.description)
+    own = _ome_sizes(pixels) if pixels else _imagej_sizes(page, fields)
+    scale = _imagej_scale(fields, notes) if page.dtype is not None and page.dtype.kind == "u" else (1.0, 0.0)
+    return Tiff(None, own or _resolution(page), own is not None, scale, notes)
+
+
+def _imagej_scale(fields: dict[str, str], notes: list[str]) -> tuple[float, float]:
+    """Return slope and intercept of ImageJ's calibration, if it is a straight line; others are noted."""
+    curve = fields.get("cf", IMAGEJ_LINE if {"c0", "c1"} <= fields.keys() else IMAGEJ_NONE)
+    if curve == IMAGEJ_LINE:
+        try:
+            slope, intercept = float(fields["c1"]), float(fields["c0"])
+            if slope and np.isfinite([slope, intercept]).all():
+                return slope, intercept
+        except (KeyError, ValueError):
+            pass
+    if curve != IMAGEJ_NONE:
+        notes.append("its values are as stored: ImageJ's calibration of them is no straight line and is not applied")
+    return 1.0, 0.0
 
 
 def _values(series: Any) -> NDArray:
@@ -276,11 +367,8 @@ def _ome_sizes(pixels: dict[str, str]) -> list[float | None]:
     return sizes
 
 
-def _imagej_sizes(page: Any) -> list[float | None] | None:
+def _imagej_sizes(page: Any, fields: dict[str, str]) -> list[float | None] | None:
     """Return ImageJ's calibration, mm; None if it has no unit of length."""
-    fields: dict[str, str] = {}
-    for line in page.description.splitlines():
-        key, _, fields[key] = line.partition("=")
     if "unit" not in fields or mm_of_unit(fields["unit"]) is None:
         return None
     units = [mm_of_unit(fields.get(name) or fields["unit"], name) for name in ("unit", "yunit", "zunit")]

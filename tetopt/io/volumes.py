@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ IMAGE_BYTES = 8  # per voxel of an `Image`, at most
 # Messages for a file that ends too soon, and for one that may not be an image.
 DAMAGED_FILE = "the file is truncated or damaged; copy it again"
 TRAILING_BYTES = 2**24  # 17 MB after the last voxel: MGH's tags
+# Stored numbers of so many bits, rescaled by whole numbers up to these, are exact in float32.
+EXACT_BITS, LARGEST_SLOPE, LARGEST_INTERCEPT = 16, 64, 2**22
 TOO_LONG = f"{DAMAGED_FILE} (it continues far after the last voxel, beyond byte {{}})"
 UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 
@@ -108,6 +110,18 @@ def check_room(sizes: Sequence[int], value_bytes: int, remedy: str = "crop or re
     count = math.prod(sizes[:3])
     shape = " x ".join(str(size) for size in sizes[:3])
     check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", remedy)
+
+
+def exact_type(bits: int, scales: Iterable[tuple[float, float]]) -> type[np.floating[Any]]:
+    """Return the type for stored whole numbers of so many bits, multiplied by slopes, plus intercepts."""
+    is_exact = bits <= EXACT_BITS and all(
+        slope == round(slope)
+        and shift == round(shift)
+        and abs(slope) <= LARGEST_SLOPE
+        and abs(shift) <= LARGEST_INTERCEPT
+        for slope, shift in scales
+    )
+    return np.float32 if is_exact else np.float64
 
 
 def one_line(words: object) -> str:
