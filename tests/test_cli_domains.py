@@ -431,6 +431,29 @@ def test_label_zero_within_a_mask_has_a_row(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
 
 
+def test_labels_twice_finer_are_no_other_scan(tmp_path, capsys):
+    """The voxels of the image, once divided, are as many as those of the labels, which begin elsewhere."""
+    image = tetopt.Image(np.random.default_rng(0).random((8, 8, 8)), np.diag([2.0, 2.0, 2.0, 1.0]))
+    labels = np.zeros((16, 16, 16), np.uint8)
+    labels[5:11, 5:11, 5:11] = 3
+    affine = np.eye(4)
+    affine[:3, 3] = 1.5
+    tetopt.save_image(tmp_path / "a.nii.gz", image)
+    tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels, affine))
+    command = ["mesh", tmp_path / "a.nii.gz", "--labels", tmp_path / "l.nii.gz", "-o", tmp_path / "a.vtu"]
+    assert exit_code(*command, "--nodes", "100", "--iterations", "0") in (0, 1)
+    said = capsys.readouterr().err
+    assert "divided by 2 x 2 x 2" in said
+    assert "same scan" not in said
+
+
+def test_a_label_beyond_the_largest_is_refused():
+    """Also in 32 bits, in which the largest is rounded to it."""
+    labels = tetopt.Image(np.full((4, 4, 4), 2**31, np.float32))
+    with pytest.raises(tetopt.InputError, match="whole numbers from 0 to 2147483647; 64 voxels have other values"):
+        tetopt.resample_labels(labels, tetopt.Image(np.zeros((4, 4, 4))))
+
+
 def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
     """Tables count the file's own voxels, one of a label 2^31 - 1 in a sheet as thin as they are."""
     fine = tetopt.Image(np.zeros((24, 24, 24)), np.diag([1.0, 1.0, 1.0, 1.0]))

@@ -92,6 +92,13 @@ def test_names_and_colours(tmp_path, text, names, colours):
         assert table.colours == {}
 
 
+def test_names_are_printable(tmp_path):
+    assert table_of(tmp_path, "label,name\n1,a\x1b[31mb\n2147483647,\u202ec\n").names == {
+        1: "a\\x1b[31mb",
+        2147483647: "\\u202ec",
+    }
+
+
 def test_a_background_without_a_colour_has_none(tmp_path):
     assert set(table_of(tmp_path, BIDS).colours) == {1, 2}
     assert set(table_of(tmp_path, FRACTIONS).colours) == {5}
@@ -121,6 +128,7 @@ def test_a_background_without_a_colour_has_none(tmp_path):
             'line 4: label 1 is "stomach", but "spleen" on line 2; list each label only once',
         ),
         ("1 (none) 1 2 3 0\n", "expected names of labels, found none"),
+        ("label,name\n1,a\n2147483648,b\n", "line 3: expected a label up to 2147483647, got 2147483648"),
         ("label,name\n1," + 200_000 * "x" + "\n", "line 2: "),
     ],
 )

@@ -48,8 +48,8 @@ def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
     data = labels.data
     whole = np.rint(data)
     is_off = whole != data
-    if is_off.any() or data.min() < 0.0 or data.max() > LARGEST_LABEL:
-        wrong = np.argwhere((whole < 0.0) | (whole > LARGEST_LABEL) | (np.abs(data - whole) > ROUNDING_DISTANCE))
+    if is_off.any() or data.min() < 0.0 or data.max() >= LARGEST_LABEL + 1:  # in 32 bits, not exact without 1
+        wrong = np.argwhere((whole < 0.0) | (whole >= LARGEST_LABEL + 1) | (np.abs(data - whole) > ROUNDING_DISTANCE))
         if len(wrong):
             first = tuple(int(i) for i in wrong[0])
             raise InputError(

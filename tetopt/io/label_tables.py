@@ -17,11 +17,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tetopt.contents.labels import hex_colour
+from tetopt.contents.labels import LARGEST_LABEL, hex_colour
 from tetopt.errors import InputError
 from tetopt.io.itk_headers import NRRD_SUFFIXES, read_header
 from tetopt.io.read_dicom import dicom_file, read_segments_table
 from tetopt.io.segments import segments_of, segments_table
+from tetopt.io.text import plain
 from tetopt.io.volumes import one_line
 from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.system.incoming import irregular, text_of
@@ -91,6 +92,10 @@ def load_label_table(path: str | Path) -> LabelTable:
     table = LabelTable({}, {})
     of_label: dict[int, LabelEntry] = {}
     for entry in _entries(path, lines):
+        if entry.label > LARGEST_LABEL:
+            raise InputError(
+                f"{path}, line {entry.line}: expected a label up to {LARGEST_LABEL}, got {entry.label}; correct it"
+            )
         first = of_label.setdefault(entry.label, entry)
         if first._replace(line=entry.line) != entry:
             raise InputError(
@@ -190,7 +195,7 @@ def _cells(path: Path, number: int, line: str, separator: str) -> list[str]:
 
 
 def _one_line(name: str) -> str:
-    return " ".join(name.split())
+    return plain(" ".join(name.split()))
 
 
 def _colour(path: Path, line: int, texts: list[str] | tuple[str, ...], whole: float) -> tuple[float, float, float]:

@@ -131,7 +131,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Originals | None = Non
         is_cropped = slice_ is None and crop is not None
         if not is_same_grid(original, grid, is_cropped=is_cropped):
             is_linear = aligned in (resample_contrast, resample_tissue)
-            _say_resampled(other, original, moved, is_contrast=is_linear, is_cropped=is_cropped)
+            _say_resampled(other, original, moved, coarse.shape, is_contrast=is_linear, is_cropped=is_cropped)
         return moved if slice_ is None else part_of(moved, slice_, crop)
 
     if slice_ is not None:
@@ -162,18 +162,20 @@ def _times(factors: Sequence[int]) -> str:
     return " x ".join(map(str, factors))
 
 
-def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
+def _say_resampled(
+    path: Path, original: Image, moved: Image, shape: tuple[int, ...], *, is_contrast: bool, is_cropped: bool
+) -> None:
     """Report that a file was resampled; warn of a mask or labels that seem to be of another scan.
 
-    These are cut by the image's box, though the image is no crop of them, or have its shape and directions in another
-    place. Labels of FreeSurfer have their own directions.
+    These are cut by the image's box, though the image is no crop of them, or have its own `shape`, before it was
+    divided, and its directions in another place. Labels of FreeSurfer have their own directions.
     """
     note(f"{path}: resampled to the image's grid ({'linear' if is_contrast else 'nearest neighbour'})")
     if is_contrast or is_cropped or is_same_grid(original, moved, is_cropped=True):
         return
     outside = 1.0 - float(in_box(moved, original)[original.data >= min(INSIDE_FRACTION, original.data.max())].mean())
     cosines = [(each.affine[:-1, :-1] / each.spacing) for each in (original, moved)]
-    is_alike = original.shape == moved.shape and bool((np.prod(cosines, axis=0).sum(axis=0) > 0.5).all())
+    is_alike = original.shape == shape and bool((np.prod(cosines, axis=0).sum(axis=0) > 0.5).all())
     is_moved = is_alike and bool(other_box(original, moved))
     if is_moved or outside > OUTSIDE_FRACTION:
         warning(
