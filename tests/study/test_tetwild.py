@@ -11,7 +11,7 @@ import pytest
 import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
-from tetopt.study import tetwild
+from tetopt.study import endings, tetwild
 from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import interfaces
 from tetopt.study.pipelines import PIPELINES, PipelineInput
@@ -106,7 +106,7 @@ def test_missing_package(monkeypatch):
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     # In this module alone: tetopt's own names are imported lazily, by the same function.
     broken = SimpleNamespace(import_module=lambda name: __import__("tetopt_has_no_such_package"))
-    monkeypatch.setattr(tetwild, "importlib", broken)
+    monkeypatch.setattr(endings, "importlib", broken)
     with pytest.raises(tetopt.InputError, match=r"pytetwild: cannot be imported \(No module .* pip install") as error:
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     assert not isinstance(error.value, NotInstalled)

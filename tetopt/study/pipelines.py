@@ -1,4 +1,4 @@
-"""Six pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
+"""Seven pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.study.interfaces import OTSU_CLASSES, interfaces
+from tetopt.study.mmg import classes_of, remeshed
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.system.extras import install_hint
@@ -143,6 +144,21 @@ def pytetwild(job: PipelineInput) -> Produced:
     return _searched(result, seconds, surfaces.notes)
 
 
+def mmg(job: PipelineInput) -> Produced:
+    """Label a fine lattice by classes or labels, and coarsen it by Mmg, which keeps them; see `mmg`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.study.mmg.remeshed`.
+    """
+    seconds: dict[str, float] = {}
+    labels = classes_of(job.image, job.classes) if job.labels is None else job.labels
+    with _timed(seconds, "tetrahedra"):
+        result, of_cell = remeshed(job.image, labels, job.nodes, job.order, job.smoothing)
+    return _searched(result, seconds, [])._replace(labels=None if job.labels is None else of_cell)
+
+
 def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
     """Return a peer's result, with the search for the number of nodes as a separate step."""
     seconds["tetrahedra"] -= result.search_seconds
@@ -184,6 +200,10 @@ PIPELINES = {
         "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
         pytetwild, is_random=True, packages=("pytetwild",),
         hint=f"install it with: {install_hint('compare', 'pytetwild')}",
+    ),
+    "mmg": Pipeline(
+        "Mmg", "peer", "a lattice labelled by multi-Otsu classes or given labels, coarsened by Mmg, which keeps labels",
+        mmg, packages=("mmgpy",), hint=f"install it with: {install_hint('compare', 'mmgpy')}",
     ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
     "odt": Pipeline(

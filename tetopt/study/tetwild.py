@@ -16,7 +16,6 @@ requested, only a wider envelope helps. Measurements behind the choices, with E_
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -31,10 +30,9 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.endings import NotInstalled
+from tetopt.study.endings import imported
 from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
-from tetopt.system.extras import install_hint
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
 TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)  # measured slopes are -3 to -9
@@ -92,7 +90,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
     """
     if nodes < 8:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
-    tetrahedralize = _tetrahedralize()
+    tetrahedralize = imported("pytetwild").tetrahedralize
     spacing = node_spacing(image, corners_for(nodes, order))
 
     def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -114,16 +112,6 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
     raise InputError(f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes")
-
-
-def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
-    try:
-        return importlib.import_module("pytetwild").tetrahedralize
-    except ImportError as error:
-        hint = f"install it with: {install_hint('compare', 'pytetwild')}"
-        if isinstance(error, ModuleNotFoundError) and error.name == "pytetwild":
-            raise NotInstalled(f"pytetwild: not installed; {hint}") from error
-        raise InputError(f"pytetwild: cannot be imported ({error}); {hint}") from error
 
 
 def _run(

@@ -1,0 +1,58 @@
+"""Mmg as a peer: it fills the box, keeps labels, and reaches the number of nodes."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.geometry.box import ON_SIDE_VOXELS
+from tetopt.geometry.check import beyond_box
+from tetopt.geometry.simplex import volumes
+from tetopt.study.endings import NotInstalled
+from tetopt.study.mmg import classes_of, remeshed
+from tetopt.study.pipelines import PIPELINES, PipelineInput
+
+needs_mmgpy = pytest.mark.skipif(PIPELINES["mmg"].missing is not None, reason="mmgpy is not installed")
+PHANTOM = tetopt.load_phantom("two_spheres")
+IMAGE, LABELS = PHANTOM.image(voxel_mm=4), PHANTOM.label_image(voxel_mm=4)
+
+
+@needs_mmgpy
+@pytest.mark.parametrize("labels", [LABELS, None])
+def test_a_box_of_labelled_cells(labels):
+    """An oblique box is filled to the last digits; labels of the user's stay those, in their places."""
+    turned = np.array([[0.0, -4.0, 0.0, 3.0], [3.2, 0.0, -2.4, 5.0], [2.4, 0.0, 3.2, -7.0], [0.0, 0.0, 0.0, 1.0]])
+    image = tetopt.Image(IMAGE.data, turned)
+    given = None if labels is None else tetopt.Image(7 * labels.data, turned)
+    made = PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3))
+    mesh = made.mesh
+    is_near = len(mesh.points) == pytest.approx(1000, rel=0.05)
+    assert is_near != ("requested: 1000" in made.notes[-1])
+    assert len(mesh.points) == pytest.approx(1000, rel=0.2)
+    assert volumes(mesh.points, mesh.cells).min() > 0.0
+    assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(image.volume, rel=1e-12)
+    assert beyond_box(mesh, image).max() <= ON_SIDE_VOXELS
+    if given is None:
+        assert made.labels is None
+        return
+    rows = tetopt.label_fidelity(given, mesh, made.labels)
+    assert [row.label for row in rows] == [0, 7, 14]
+    assert min(row.dice for row in rows) > 0.8
+    again = PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3))
+    assert again.mesh.points.tobytes() == mesh.points.tobytes()
+
+
+def test_classes_without_labels():
+    classes = classes_of(IMAGE, 3)
+    assert np.unique(classes.data).tolist() == [0, 1, 2]
+    assert all(np.ptp(IMAGE.data[classes.data == each]) < np.ptp(IMAGE.data) for each in range(3))
+
+
+@needs_mmgpy
+def test_what_is_refused(monkeypatch):
+    with pytest.raises(tetopt.InputError, match="nodes: a box needs 8 or more, got 7"):
+        remeshed(IMAGE, LABELS, 7)
+    monkeypatch.setitem(sys.modules, "mmgpy", None)
+    with pytest.raises(NotInstalled, match=r"mmgpy: not installed; .* pip install"):
+        remeshed(IMAGE, LABELS, 100)
