@@ -35,7 +35,12 @@ SCREEN_DPI = (72.0, 96.0)  # written by default, of no meaning
 MOST_CHANNELS = 7  # of an ImageJ composite; tifffile calls the slices of a plain stack channels
 IMAGEJ_LINE, IMAGEJ_NONE = "0", "20"  # numbers of ImageJ's curves from stored to calibrated values
 ORIENTATION_TAG = 274
-FLIPS = {1: (), 2: (2,), 3: (1, 2), 4: (1,)}  # axes of (slices, rows, columns) that run the other way, as in Pillow
+FLIPPED_AXES = {
+    1: (),
+    2: (2,),
+    3: (1, 2),
+    4: (1,),
+}  # axes of (slices, rows, columns) that run the other way, as in Pillow
 AXIS_WORDS = {"C": "channels", "S": "colours", "T": "time points"}
 
 
@@ -297,7 +302,7 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
         if first.photometric == 3 and not is_imagej:
             raise InputError("expected grey slices, got a palette of colours; convert it to grey first")
         orientation = first.tags.get(ORIENTATION_TAG)
-        flips = FLIPS.get(1 if orientation is None else int(orientation.value))
+        flips = FLIPPED_AXES.get(1 if orientation is None else int(orientation.value))
         if flips is None:
             raise InputError(f"its Orientation {orientation.value} swaps rows and columns; export it upright")
         check_room(shape, series[0].dtype.itemsize)
