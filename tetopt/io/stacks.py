@@ -34,7 +34,7 @@ MM_OF_RESOLUTION = {2: 25.4, 3: 10.0}  # TIFF's ResolutionUnit: inch, cm
 SCREEN_DPI = (72.0, 96.0)  # written by default, of no meaning
 MOST_CHANNELS = 7  # of an ImageJ composite; tifffile calls the slices of a plain stack channels
 IMAGEJ_LINE, IMAGEJ_NONE = "0", "20"  # numbers of ImageJ's curves from stored to calibrated values
-ORIENTATION_TAG = 274
+ORIENTATION_TAG = 274  # of TIFF
 FLIPPED_AXES = {
     1: (),
     2: (2,),
