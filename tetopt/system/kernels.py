@@ -327,10 +327,11 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
 
 
 def _n_kept(order: Sequence[Any], first: int) -> int:
-    """Return the number of kernels before the next uncached one, starting at `first`; compiles that one."""
+    """Return the number of kernels before the next one that is neither cached nor compiled; compile that one."""
     for number, kernel in enumerate(order[first:], start=first):
+        is_compiled = "compiled" in vars(kernel)  # by this process, so that later calls need not look for it
         kernel.link()
-        if not kernel.was_cached:
+        if not (is_compiled or kernel.was_cached):
             return number
     return len(order)
 
