@@ -81,7 +81,7 @@ def load_image(
     The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra ``tetopt[itk]``)
     reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads 2-D pictures and folders with one of
     them per slice, tifffile (``tetopt[tiff]``) TIFF stacks with the calibration of ImageJ or OME; zarr
-    (``tetopt[blocks]``) reads OME-Zarr and Zarr arrays, and only the requested part;
+    (``tetopt[zarr]``) reads OME-Zarr and Zarr arrays, and only the requested part;
     `tetopt.io.stored_images.open_stored` describes their placement. Axes of length 1 beyond the third are dropped.
 
     NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS coordinates are converted to

@@ -83,7 +83,7 @@ def with_parts(plan: Plan) -> Plan:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
     if job.worker_gb is not None and job.scheduler is not None:
         raise InputError("`worker_gb`: only for workers on this machine; those of `scheduler` have their own limits")
-    check_workers(job.workers, job.scheduler, "blocks")
+    check_workers(job.workers, job.scheduler, "zarr")
     file = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
     return plan._replace(division=Division(job.parts or 1), left=file if _is_left(plan) else None)
 
