@@ -34,7 +34,7 @@ extensions = [
     "command_pages",
     "schema_pages",
 ]
-exclude_patterns = ["_build", "_extensions", "_templates", "measured/templates", "examples/GALLERY_HEADER.rst"]
+exclude_patterns = ["_build", "_extensions", "_templates", "examples/GALLERY_HEADER.rst"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nitpicky = False

@@ -5,7 +5,7 @@
 
 DATA is a folder with the images of `FILES`. Each measurement runs its commands one after the other, in a folder of its
 own, and replaces its entry in docs/measured/measured.json, with version, commit, date and machine. Pages are written
-from docs/measured/templates and that file (`--pages`: without measuring). Leave the machine idle: the whole takes an
+from scripts/templates and that file (`--pages`: without measuring). Leave the machine idle: the whole takes an
 hour and a half on two cores, with CGAL.
 """
 
@@ -38,7 +38,7 @@ from tetopt.system.files import save_json
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "measured" / "measured.json"
 PAGES = ROOT / "docs" / "measured"
-TEMPLATES = PAGES / "templates"
+TEMPLATES = ROOT / "scripts" / "templates"
 README = "README.md"  # also the name of the template of its part between MARKS
 LOG = "log.txt"  # in the folder of a measurement: what its commands print
 MARKS = ("<!-- from make measured -->", "<!-- end of make measured -->")
