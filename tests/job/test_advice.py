@@ -102,7 +102,7 @@ def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
         assert text.count("allow more nodes") == n_remedies
         assert text.count("0 (voxels without a label, enclosed or bright)") == (2 if word == "foreground" else 0)
     told(*unmet({"labels": "..."}, {"labels": [air._replace(is_lost=True)]}, "foreground"))
-    assert said().endswith("label 0 (voxels without a label, enclosed or bright), of more than 200 voxels\n")
+    assert said().endswith("of more than 200 voxels, lies in a cell with that label\n")
 
 
 def ended(E=0.5, E_D=0.5):

@@ -96,7 +96,7 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> W
     load = -stiffness_product(modulus, nu, u)[inside].ravel()
     if len(load) == 0:
         return Work(0, 0.0)
-    index = np.stack(np.indices(u.shape[:-1], dtype=np.float64), axis=-1)[inside].reshape(-1, n)
+    index = np.moveaxis(np.indices(u.shape[:-1]), 0, -1)[inside].reshape(-1, n).astype(np.float64)
     K = free_stiffness(modulus, nu)
     modes = rigid_modes(modulus.to_world(index))
     solution, n_steps = solved_in_steps(System(K, np.arange(len(load)), K, load, np.zeros(len(load)), modes, np.eye(n)))

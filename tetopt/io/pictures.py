@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +49,7 @@ def frame_of(path: str, volume: int | None) -> NDArray:
         width, height = picture.size
         if width * height > MOST_PIXELS:
             raise InputError(f"expected at most {MOST_PIXELS} pixels, got {height} x {width}; crop or resample it")
-        tags = picture.tag_v2 if picture.format == "TIFF" else {}
+        tags: Mapping[int, Any] = getattr(picture, "tag_v2", {})  # of TIFF alone
         is_inverted = tags.get(PHOTOMETRIC_TAG) == 0 and picture.mode in ("1", "L")  # by Pillow, in no other mode
         values = np.asarray(picture)
         return _grey(~values if is_inverted else values, picture.mode)

@@ -301,10 +301,11 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
             )
         if first.photometric == 3 and not is_imagej:
             raise InputError("expected grey slices, got a palette of colours; convert it to grey first")
-        orientation = first.tags.get(ORIENTATION_TAG)
-        flips = FLIPPED_AXES.get(1 if orientation is None else int(orientation.value))
+        tag = first.tags.get(ORIENTATION_TAG)
+        orientation = 1 if tag is None else int(tag.value)
+        flips = FLIPPED_AXES.get(orientation)
         if flips is None:
-            raise InputError(f"its Orientation {orientation.value} swaps rows and columns; export it upright")
+            raise InputError(f"its Orientation {orientation} swaps rows and columns; export it upright")
         check_room(shape, series[0].dtype.itemsize)
         parts = [_values(each) for each in series]
         data = (parts[0] if len(parts) == 1 else np.stack(parts)).reshape(shape)
