@@ -123,7 +123,7 @@ def optimize(
     sizes : Sizes, optional
         Targets and limits for the edges that exchanges make, with `nodes`.
     tolerance : float
-        The run has converged if E changes by less, relatively, in an iteration.
+        The run ends if E falls by less, relatively, in an iteration; it has converged if E does not rise by more.
     max_seconds : float, optional
         Stop at the next colour of nodes after this time; the mesh is valid. Lifting cells above the minimum dihedral
         angle may take another tenth of the run's time, or half a second; the iteration's flips and labels take more.
@@ -212,7 +212,7 @@ def followed(
     callback: Callable[[IterationRecord], None] | None,
     keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
 ) -> tuple[list[IterationRecord], str]:
-    """Do the iterations of a course; return the records and "iterations", "converged" or "over"."""
+    """Do the iterations of a course; return the records and "iterations", "converged", "risen" or "over"."""
     history: list[IterationRecord] = []
     min_dihedral, nodes, E = course.min_dihedral, course.nodes, 0.0
 
@@ -254,17 +254,15 @@ def followed(
         is_finished = is_finished and (iteration == course.last or not is_over())
         if not is_finished and keep is not None:
             keep(run.mesh(), run.labels())
-        # Interfaces that follow their surfaces may raise E: only a small change, up or down, is none.
-        is_settled = abs(fall) < course.tolerance and not is_early
-        is_last = iteration == course.last or not is_finished or is_settled
+        is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
         n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
         # 5. Measure.
         record(iteration, movement, n_changes > 0)
         if not is_finished:
             return history, "over"
-        if is_last and abs(fall) < course.tolerance:
-            return history, "converged"
+        if is_last and fall < course.tolerance:  # interfaces that follow their surfaces may raise E
+            return history, "converged" if abs(fall) < course.tolerance else "risen"
     return history, "iterations"
 
 

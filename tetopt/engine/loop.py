@@ -105,7 +105,7 @@ class MeshingResult(NamedTuple):
         The optimised mesh.
     history : list of Record
         One row per iteration, starting with the initial mesh.
-    ended : {"iterations", "converged", "max_seconds", "stopped"}
+    ended : {"iterations", "converged", "risen", "max_seconds", "stopped"}
         Reason for the end of the run.
     initial : Mesh
         The mesh at the start of the run.

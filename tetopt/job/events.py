@@ -75,6 +75,8 @@ def ended_words(ended: str, kept: str) -> str:
     """Return why a run ended before its last iteration, and what is kept."""
     if ended == "converged":
         return "converged: the mesh hardly changes any more"
+    if ended == "risen":
+        return "ended, as E no longer falls: nodes follow the interfaces of labels"
     return f"{ENDED_WORDS[ended]}: {kept} is kept"
 
 
