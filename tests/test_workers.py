@@ -33,6 +33,8 @@ from tetopt.workers import (
 
 GB = 1e9
 LIMIT = 0.4e9  # of a worker, which has 0.1 GB
+# Of a cluster of somebody else's, without processes of its own.
+IN_PROCESS = {"processes": False, "protocol": "tcp://", "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
 
 
 @pytest.mark.parametrize(
@@ -196,10 +198,7 @@ def of_session(number):
 @pytest.fixture(scope="module")
 def others():
     """A cluster of somebody else's, within this process: 2 workers with 8 GB each."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", memory_limit="8GB",
-        dashboard_address="127.0.0.1:0", silence_logs=50,
-    ) as cluster:  # fmt: skip
+    with LocalCluster(n_workers=2, threads_per_worker=1, memory_limit="8GB", **IN_PROCESS) as cluster:
         yield cluster
 
 
@@ -231,14 +230,7 @@ def test_workers_that_cannot_run_tasks_are_refused(others, tmp_path, monkeypatch
         with pytest.raises(UnfitWorker, match=r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and"):
             list(run_tasks(pool, limit_of, "a", str(tmp_path)))
     with (
-        LocalCluster(
-            n_workers=1,
-            threads_per_worker=2,
-            processes=False,
-            protocol="tcp://",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=50,
-        ) as cluster,
+        LocalCluster(n_workers=1, threads_per_worker=2, **IN_PROCESS) as cluster,
         workers(NOTHING, cluster.scheduler.address, None) as pool,
         pytest.raises(UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"),
     ):
@@ -248,14 +240,7 @@ def test_workers_that_cannot_run_tasks_are_refused(others, tmp_path, monkeypatch
 def test_tasks_wait_for_workers_and_a_lost_scheduler_is_said(tmp_path):
     """Jobs of a batch system come after hours."""
     with (
-        LocalCluster(
-            n_workers=0,
-            threads_per_worker=1,
-            processes=False,
-            protocol="tcp://",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=50,
-        ) as cluster,
+        LocalCluster(n_workers=0, threads_per_worker=1, **IN_PROCESS) as cluster,
         workers(NOTHING, cluster.scheduler.address, None) as pool,
     ):
         assert pool.slots() == 0
