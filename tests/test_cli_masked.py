@@ -90,6 +90,12 @@ def test_other_masks_labels_and_images(organ, tmp_path, capsys):
     labels = ["convert", organ / "a.vtu", tmp_path / "l.vtu", "--labels", organ / "l.nii.gz", "--young", "1=1,2=9"]
     assert exit_code(*labels) == 0
     assert set(tetopt.load_mesh(tmp_path / "l.vtu").cell_data["label"].tolist()) == {2}
+    what = tetopt.content(image, mask=tetopt.load_image(tmp_path / "other.nii.gz"))
+    with pytest.warns(UserWarning, match="the content's mask differs in [0-9]+ voxels"):
+        tetopt.build_model(tetopt.load_mesh(organ / "a.vtu"), what, young=LAW)
+    for function in (tetopt.build_model, tetopt.cell_fields):
+        with pytest.warns(UserWarning, match="built within another mask"):
+            function(tetopt.load_mesh(organ / "a.vtu").mesh, what)
     lost = tetopt.load_mesh(organ / "a.vtu")
     tetopt.save_mesh(tmp_path / "lost.vtu", lost.mesh, about={"inputs": lost.text("inputs")})
     capsys.readouterr()
@@ -107,6 +113,34 @@ def test_other_masks_labels_and_images(organ, tmp_path, capsys):
     words = ["fem", tmp_path / "lost.vtu", *with_image, "--mask", organ / "m.nii.gz", "--young", LAW]
     assert exit_code(*words, "--average", "mean", "--load", "compress:1%", "-o", tmp_path / "s.vtu") == 0
     np.testing.assert_array_equal(moduli(tmp_path / "s.vtu"), moduli(organ / "a.vtu"))
+
+
+def test_an_image_in_another_place(organ, tmp_path, capsys):
+    """Commands that take voxels of it refuse; an improved mesh is warned of, since it may be registered."""
+    image = tetopt.load_image(organ / "ct.nii.gz")
+    affine = image.affine.copy()
+    affine[0, 3] += 3.0 * image.spacing[0]
+    moved, mesh = tmp_path / "moved.nii.gz", organ / "a.vtu"
+    tetopt.save_image(moved, tetopt.Image(image.data, affine))
+    for words in (
+        ["quality", mesh], ["segment", mesh, "-o", tmp_path / "s.nii"], ["view", mesh, "--html", tmp_path / "v.html"],
+        ["convert", mesh, tmp_path / "c.vtu"], ["fem", mesh],
+    ):  # fmt: skip
+        assert exit_code(*words, "--image", moved) == 2
+        assert "moved.nii.gz: expected the box of" in capsys.readouterr().err
+    assert exit_code("quality", mesh, "--image", moved, "--registered") == 0
+    assert "was built from a different image, not" in capsys.readouterr().err
+    words = ["mesh", moved, "--start", mesh, "-o", tmp_path / "b.vtu", "--iterations", "1"]
+    assert exit_code(*words) in (0, 1)
+    assert "moved.nii.gz: its box was" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("command", ["quality", "view"])
+def test_options_of_an_image_need_one(organ, tmp_path, capsys, command):
+    words = [command, organ / "a.vtu", *(["--html", tmp_path / "v.html"] if command == "view" else [])]
+    for options in (["--mask", organ / "m.nii.gz"], ["--registered"], ["--crop", "1:,:,:"]):
+        assert exit_code(*words, *options) == 2
+        assert f"{options[0]}: needs --image" in capsys.readouterr().err
 
 
 def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):

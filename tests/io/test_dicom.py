@@ -591,7 +591,7 @@ def test_names_and_colours_of_segments(tmp_path, hd):
 
 
 @pytest.mark.full
-def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd):
+def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd, capsys):
     """Frames in another order, and a segmentation with fewer slices: labels lie where they were, with their names."""
     k, j, i = np.indices((16, 30, 20))
     world = ORIGIN + i[..., None] * BETWEEN_COLUMNS * AXES[0] + j[..., None] * BETWEEN_ROWS * AXES[1]
@@ -600,11 +600,14 @@ def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd):
     far = np.linalg.norm(world - centre, axis=-1)
     voxels = np.stack([far < 6, (k == 3) & (i < 4) & (j < 9), (k == 13) & (i > 15)], axis=-1)
     order = np.random.default_rng(0).permutation(16)
-    scan = saved(tmp_path / "ct.dcm", enhanced(1000 * (far < 6)[order], places(16)[order]))
+    data = enhanced(1000 * (far < 6)[order], places(16)[order])
+    data.FrameOfReferenceUID = "1.2.5"
+    scan = saved(tmp_path / "ct.dcm", data)
     labels = segmentation(hd, tmp_path / "seg.dcm", voxels)
     assert exit_code("mesh", scan, "--labels", labels, "-o", tmp_path / "a.vtu", "--nodes", 900) == 0
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
     assert loaded.label_table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
+    assert "frame of reference" not in capsys.readouterr().err
     points = loaded.mesh.points[loaded.mesh.cells]
     volume = np.abs(np.linalg.det(points[:, 1:] - points[:, :1])) / 6
     is_in = loaded.cell_data["label"] == 1
@@ -612,3 +615,8 @@ def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd):
     assert volume[is_in].sum() == pytest.approx(expected, rel=0.03)
     at = np.average(points[is_in].mean(axis=1), axis=0, weights=volume[is_in])
     np.testing.assert_allclose(at, centre * [-1, -1, 1], rtol=0, atol=0.2)
+    data.FrameOfReferenceUID = "1.2.99"
+    other = saved(tmp_path / "other.dcm", data)
+    words = ["-o", tmp_path / "b.vtu", "--nodes", 50, "--iterations", 0]
+    assert exit_code("mesh", other, "--labels", labels, *words) in (0, 1)
+    assert "seg.dcm: its positions are in another frame of reference" in capsys.readouterr().err.replace("\n  ", " ")

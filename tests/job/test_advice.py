@@ -113,11 +113,16 @@ def ended(E=0.5, E_D=0.5):
     return MeshingResult(MESH, history, "iterations", MESH)
 
 
+def started_only():
+    return MeshingResult(MESH, ended().history[:1], "iterations", MESH)
+
+
 @pytest.mark.parametrize(
     ("result", "mode", "nodes", "measured", "words"),
     [
         (ended(), "graded", 100, {}, ""),
         (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations"),
+        (started_only(), "graded", 120, {}, "100 nodes instead of 120, as no iteration was made; allow some"),
         (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
         (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),

@@ -57,7 +57,7 @@ def test_python_has_the_numbers_of_the_commands(place, capfd):
 
 def test_refusals_name_arguments(place):
     mesh = place / "a.vtu"
-    with pytest.raises(InputError, match=r"^`mask` and `labels`: need an `image`"):
+    with pytest.raises(InputError, match=r"^`labels`: needs `image`"):
         judge(mesh, labels=place / "image.nii.gz")
     with pytest.raises(InputError, match=r"moduli: pass `young`"):
         solve_file(mesh, model=ModelOptions(), part=LabelledPart())

@@ -39,7 +39,7 @@ def quality_command(
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     numbers.check()
     mesh, image = mesh_and_image(paths, image)
-    came = judge(mesh, image, region.mask, labels, region.mask_label, part=part, label_names=label_names, check=check)
+    came = judge(mesh, image, labels, part=part, region=region, label_names=label_names, check=check)
     numbers.save(came.numbers)
     size, source = came.numbers["size"], came.source
     table = new_table("", escape(mesh.name))

@@ -44,7 +44,7 @@ def segment_command(
     what = content_within(image_path, part, region, loaded)
     image, mesh = what.given, loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
-    warn_of_other_image(loaded, mesh_path, image_path)
+    warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=region.registered)
     inside = _voxels_in(mesh, what, mesh_path, image_path)
     labels = segment(what, mesh, classes)
     of_class, h = labels.data[inside].astype(np.int64), image.data[inside]

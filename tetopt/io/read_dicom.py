@@ -113,6 +113,13 @@ def read_segments_table(path: Path) -> LabelTable:
     return LabelTable(names, {number: tuple(parts) for number, parts in colours.items()})
 
 
+def frame_of_reference(path: Path) -> str | None:
+    """Return the UID of the frame of reference of a file or a folder's first; None if not DICOM or without one."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    first = next((file for file in files if file.is_file() and is_dicom(file)), None)
+    return None if first is None else _read(frame_of, first)
+
+
 def dicom_file(path: Path) -> Path | None:
     """Return the path if it is a DICOM file, or the only one in this folder; otherwise None."""
     files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path] if path.is_file() else []
@@ -168,6 +175,18 @@ def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
             rows.append((number, _name(segment), [] if lab is None else _srgb([int(part) for part in lab])))
     count = Counter(name for _, name, _ in rows)
     return [(number, name if count[name] == 1 or not name else f"{name} {number}", tone) for number, name, tone in rows]
+
+
+def frame_of(path: str) -> str | None:
+    """Return the UID of a file's frame of reference."""
+    import pydicom
+
+    with _errors_of("the file"):
+        return _world(pydicom.dcmread(path, force=True, stop_before_pixels=True))
+
+
+def _world(tags: Any) -> str | None:
+    return plain(str(tags.get("FrameOfReferenceUID") or "")) or None
 
 
 def _segments(file: DicomFile) -> dict[int, Any]:
@@ -366,7 +385,7 @@ def _check_world(files: list[DicomFile]) -> None:
     """Raise InputError for files whose positions are in different frames of reference."""
     stated: dict[str, DicomFile] = {}
     for file in files:
-        if uid := plain(str(file.tags.get("FrameOfReferenceUID") or "")):
+        if uid := _world(file.tags):
             stated.setdefault(uid, file)
     if len(stated) > 1:
         (one, first), (other, second) = list(stated.items())[:2]

@@ -178,10 +178,11 @@ def of_result(
             yield Problem(f"{text}: the target sizes need about {needed}", remedy)
         elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
             yield Problem(f"{text}: most cells contain no voxel centre", wants="larger")
-        elif n_nodes < nodes:
-            yield Problem(text, "use more iterations, a `k_D` above 0, or smaller sizes", wants="smaller")
+        elif result.history[-1].iteration == 0:
+            yield Problem(f"{text}, as no iteration was made", "allow some `iterations`")
         else:
-            yield Problem(text, "use more iterations, a `k_D` above 0, or larger sizes", wants="larger")
+            wants: Literal["smaller", "larger"] = "smaller" if n_nodes < nodes else "larger"
+            yield Problem(text, f"use more iterations, a `k_D` above 0, or {wants} sizes", wants=wants)
     lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
     if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         text = f"E ended at {last.E:.4f}, above its minimum {lowest:.4f}: a tessellation in the first n_t iterations"
@@ -199,8 +200,13 @@ def has_most_empty(result: MeshingResult, n_empty: int) -> bool:
     return 2 * n_empty > len(result.mesh.cells)
 
 
-def of_empty(result: MeshingResult, n_nodes: int, n_empty: int, spacing: NDArray[np.float64]) -> Iterator[Problem]:
-    """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm."""
+def of_empty(
+    result: MeshingResult, n_nodes: int | None, n_empty: int, spacing: NDArray[np.float64]
+) -> Iterator[Problem]:
+    """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm.
+
+    `n_nodes` is None if they cannot be chosen.
+    """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_CELLS * n_cells:
         return
@@ -210,6 +216,8 @@ def of_empty(result: MeshingResult, n_nodes: int, n_empty: int, spacing: NDArray
     )
     if spacing.max() >= THICK_SLICES * spacing.min():
         yield Problem(f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them")
+    elif n_nodes is None:
+        yield Problem(text)
     else:
         fewer = float(f"{n_nodes * (1.0 - n_empty / n_cells):.2g}")
         yield Problem(text, f"reduce `nodes` to about {fewer:.0f}", wants="larger")

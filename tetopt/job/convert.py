@@ -68,7 +68,7 @@ def convert_file(
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
         raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
-    check_part(part, image)
+    check_part(image, part, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
     loaded = with_labels(loaded, part.labels, part)
@@ -82,7 +82,7 @@ def convert_file(
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
     if image is not None:
         what = content_within(image, part, part, loaded)
-        if warn_of_other_image(loaded, mesh, image, None if part.registered else what.given):
+        if warn_of_other_image(loaded, mesh, image, what.given, is_registered=part.registered):
             about = texts_of(loaded, is_other=True)
         voxels, box = what.image, box_of(what.given) if box is None else box
         about |= {"image": image.name, "image_sha256": sha256(image)}

@@ -34,11 +34,12 @@ from tetopt.image import Image
 from tetopt.io.images import file_shape, has_own_spacing, load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
 from tetopt.io.meshes import load_mesh
+from tetopt.io.read_dicom import frame_of_reference
 from tetopt.io.stacks import parse_spacing
 from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
-from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, own_mask
+from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask
 from tetopt.model.labels import NO_TABLE, TABLE_TEXT, label_words, labels_named, labels_of, table_words
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
@@ -124,6 +125,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Originals | None = Non
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
         original = originals.get((other, aligned)) or read_companion(other, part.spacing_mm)
+        _warn_of_other_world(path, other)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
         moved = aligned(original, grid, str(other))
@@ -137,6 +139,17 @@ def image_and_others(path: Path, part: ImagePart, finest: Originals | None = Non
     if slice_ is not None:
         factors = tuple(factor for axis, factor in enumerate(factors) if axis != slice_[0])
     return Aligned(image, beside, factors)
+
+
+def _warn_of_other_world(path: Path, other: Path) -> None:
+    """Warn of two DICOM files whose positions are in different frames of reference."""
+    one = frame_of_reference(file_and_volume(other)[0])
+    two = None if one is None else frame_of_reference(path)
+    if two is not None and one != two:
+        warning(
+            f"{other}: its positions are in another frame of reference than those of {path} ({one}, not {two}): the "
+            "patient may have been moved between them; register it to the image first"
+        )
 
 
 def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> tuple[int, ...]:
@@ -275,9 +288,7 @@ def mask_for(
         read_mask(options)
         return None if loaded is None else own_mask(loaded, image)
     mask = beside(options.mask, resample_mask)
-    own = None if loaded is None or MASK_TEXT not in loaded.field_data else own_mask(loaded, image)
-    n_other = 0 if own is None else int(((own.data >= INSIDE_FRACTION) != (mask.data >= INSIDE_FRACTION)).sum())
-    if n_other:
+    if loaded is not None and (n_other := count_of_other_voxels(loaded, mask)):
         warning(f"{options.mask}: differs in {n_other} voxels from the mask that the mesh was built within")
     return mask
 
@@ -317,10 +328,10 @@ def read_mask(options: MaskPart | SourceOptions, names_of: Path | None = None) -
     return {(path, resample_mask): Image(np.isin(mask.data, chosen), mask.affine)}
 
 
-def check_part(part: LabelledPart, image: Path | None) -> None:
-    """Raise InputError for options that select the voxels of an image if there is none."""
-    needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
-    needs_image |= {"mask": part.mask, "mask_label": part.mask_label} if part.labels is None else {}
+def check_part(image: Path | None, part: BoxPart, region: MaskPart, labels: Path | None = None) -> None:
+    """Raise InputError for options that select the voxels of an image if there is none; labels may have a mask."""
+    needs_image: dict[str, Any] = {**stated_part(part), "registered": region.registered or None}
+    needs_image |= {"mask": region.mask, "mask_label": region.mask_label} if labels is None else {}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs `image`")
 
@@ -415,24 +426,26 @@ def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
 
 
 def warn_of_other_image(
-    loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image | None = None, *, is_exact: bool = False
-) -> bool:
+    loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image, *,
+    is_registered: bool = False, is_exact: bool = False,
+) -> bool:  # fmt: skip
     """Warn if the mesh's file names another source image than this one; return whether it does.
 
-    Reject such an `image`, if given, unless it has the source's box to a voxel; with `is_exact`, reject any image with
-    another box.
+    Reject such an image unless it is registered or has the source's box to a voxel; with `is_exact`, reject any image
+    with another box.
     """
-    made_from, box = loaded.text("image_sha256"), loaded.box
+    made_from, box, words = loaded.text("image_sha256"), loaded.box, ""
     is_other = made_from is not None and made_from != sha256(image_path)
-    if image is not None and box is not None and len(box.shape) == image.ndim and (is_other or is_exact):
-        tolerance, remedy = SAME_BOX_VOXELS, "if it is registered to that image of the same subject, pass `registered`"
-        if is_exact:
-            tolerance, remedy = SAME_GRID_VOXELS, "`check` needs that image, with its crop"
-        if words := other_box(box, image, tolerance):
-            name = f"{mesh_path}'s image, {loaded.text('image')}"
-            raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
+    if (is_exact or is_other) and box is not None and len(box.shape) == image.ndim:
+        words = other_box(box, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)
+    if words and (is_exact or not is_registered):
+        remedy = "if it is registered to that image of the same subject, pass `registered`"
+        remedy = "`check` needs that image, with its crop" if is_exact else remedy
+        name = f"{mesh_path}'s image, {loaded.text('image')}"
+        raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
     if is_other:
-        warning(f"{mesh_path} was built from a different image, not {image_path}")
+        of_box = f": its box was {words}" if words else ""
+        warning(f"{mesh_path} was built from a different image, not {image_path}{of_box}")
     return is_other
 
 

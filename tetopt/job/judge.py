@@ -14,8 +14,8 @@ from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
-from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
-from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskPart, SourceOptions
+from tetopt.job.inputs import check_part, label_table, read_companion, read_mesh, warn_of_other_image
+from tetopt.job.options import NO_MASK, WHOLE_IMAGE, ImagePart, MaskPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
@@ -104,9 +104,8 @@ class Judgement(NamedTuple):
 
 
 def judge(
-    mesh: Path, image: Path | None = None, mask: Path | None = None, labels: Path | None = None,
-    mask_label: str | None = None,
-    *, part: ImagePart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
+    mesh: Path, image: Path | None = None, labels: Path | None = None,
+    *, part: ImagePart = WHOLE_IMAGE, region: MaskPart = NO_MASK, label_names: Path | None = None, check: bool = False,
 ) -> Judgement:  # fmt: skip
     """Measure a mesh's file: its shape and, given an image, mask and labels, the fit of its cells.
 
@@ -115,12 +114,13 @@ def judge(
     Raises
     ------
     InputError
-        Files cannot be read, or the files that they belong to are missing; with `check`, the image has a different box
-        than that of the mesh's run.
+        Files cannot be read, or the files that they belong to are missing; the image has a different box
+        than that of the mesh's run, unless it is registered and `check` is not requested.
     """
-    if image is None and (mask is not None or labels is not None):
-        raise InputError("`mask` and `labels`: need an `image`, on whose voxels they are compared")
-    if label_names is not None and labels is None and mask_label is None:
+    check_part(image, part, region)
+    if image is None and labels is not None:
+        raise InputError("`labels`: needs `image`, on whose voxels they are compared")
+    if label_names is not None and labels is None and region.mask_label is None:
         raise InputError("`label_names`: needs `labels` or `mask_label`")
     loaded = read_mesh(mesh)
     shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
@@ -129,10 +129,10 @@ def judge(
         numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
-        region = MaskPart(mask=mask, mask_label=mask_label)
         source = _source(loaded, image, region, labels, part, label_names)
-        warn_of_other_image(loaded, mesh, image, source.contrasts[0] if check else None, is_exact=check)
-        has_mask = mask is not None or loaded.table("inputs").get("background") is not None
+        first, is_registered = source.contrasts[0], region.registered
+        warn_of_other_image(loaded, mesh, image, first, is_registered=is_registered, is_exact=check)
+        has_mask = region.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded, labels).names)
@@ -155,7 +155,7 @@ def _source(
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
-        images=[image], labels=labels, **vars(part), **vars(region),
+        images=[image], labels=labels, **vars(part), mask=region.mask, mask_label=region.mask_label,
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,

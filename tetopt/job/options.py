@@ -92,13 +92,16 @@ MaskLabelOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class MaskPart:
-    """Mask of the voxels that count for a mesh's file."""
+    """Voxels of an image that count for a mesh's file, and whether it may be another image than the mesh's."""
 
     mask: Annotated[
         Path | None,
         Option("MASK", "The mask that the mesh was built within, unless its file contains it: no other voxel counts."),
     ] = None
     mask_label: MaskLabelOption = None
+    registered: Annotated[
+        bool, Option(None, "Accept an image other than the mesh's, registered to it, even if its box differs.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,9 +112,6 @@ class LabelledPart(MaskPart, ImagePart):
         Path | None,
         Option("LABELS", "Label image: each cell gets its voxels' majority label, for modulus mappings and sets."),
     ] = None
-    registered: Annotated[
-        bool, Option(None, "Accept an image other than the mesh's, registered to it, even if its box differs.")
-    ] = False
 
 
 WHOLE_BOX, WHOLE_IMAGE, NO_MASK = BoxPart(), ImagePart(), MaskPart()
@@ -408,9 +408,9 @@ class JobOptions(OutputOptions, SolverOptions, PartsOptions, EngineOptions, Star
     """Every option of a run; `tetopt.job.plan` checks that they are consistent."""
 
 
-def stated_part(part: ImagePart) -> dict[str, int | str | None]:
+def stated_part(part: BoxPart) -> dict[str, int | str | None]:
     """Return the selected part of an image as files of numbers state it."""
-    return {"volume": part.volume, "crop": part.crop, "slice": part.slice_}
+    return {"volume": part.volume, "crop": part.crop, "slice": getattr(part, "slice_", None)}
 
 
 def has_model(options: SolverOptions) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from tetopt.errors import InputError
@@ -12,7 +14,7 @@ from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
 from tetopt.job.events import note, started, warning
 from tetopt.job.in_parts import left_source, with_parts
-from tetopt.job.inputs import label_table, read_mesh, set_threads
+from tetopt.job.inputs import label_table, read_mesh, set_threads, warn_of_other_image
 from tetopt.job.job import Job
 from tetopt.job.plan import Plan, changed, nodes_of_targets, plan, with_numbers
 from tetopt.job.request import requested
@@ -64,7 +66,9 @@ def read_planned(plan: Plan) -> Task:
     source = left_source(plan) or read_source(plan.job, plan.job.label_names, loaded=begun)
     plan.division.check_image(source.content.image)
     if begun is not None:
-        _check_place(begun.mesh, source.contrasts[0], str(plan.job.start))
+        image, path = source.contrasts[0], Path(str(plan.job.start))
+        _check_place(begun.mesh, image, str(path))
+        warn_of_other_image(begun, path, source.paths[0], image, is_registered=True)
         if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed(plan.job, order=2))
         if source.labels is not None and not source.table.names:

@@ -181,7 +181,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
     n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
-    empty = list(of_empty(came.result, n_nodes, n_empty, spacing))
+    empty = list(of_empty(came.result, None if mode == "start" else n_nodes, n_empty, spacing))
     problems = [*empty, *problems] if has_most_empty(came.result, n_empty) else [*problems, *empty]
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))

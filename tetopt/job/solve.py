@@ -100,7 +100,7 @@ def _check_options(image: Path | None, compress: float | None, model: ModelOptio
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
         raise InputError("`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5")
-    check_part(part, image)
+    check_part(image, part, part, part.labels)
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
@@ -139,7 +139,8 @@ def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPa
     if image is not None:
         what = content_within(image, part, part, loaded)
         whole, voxels = what.given, what.image
-        about = texts_of(loaded, is_other=warn_of_other_image(loaded, path, image, None if part.registered else whole))
+        is_other = warn_of_other_image(loaded, path, image, whole, is_registered=part.registered)
+        about = texts_of(loaded, is_other=is_other)
         if not model.loads:
             _check_box(whole, loaded)
         box = box_of(whole)

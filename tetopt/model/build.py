@@ -15,13 +15,14 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
-from tetopt.model.fields import cell_fields
+from tetopt.model.fields import cell_fields, warn_of_other_mask
 from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
     TEXTS_KEPT,
     MeshFile,
     completed,
+    count_of_other_voxels,
     loads_in,
     moduli_in,
     own_mask,
@@ -113,7 +114,7 @@ def build_model(
     Warns
     -----
     UserWarning
-        Sets of the file had to be renamed; its loads or moduli no longer fit.
+        Sets of the file had to be renamed; its loads or moduli no longer fit; the content's mask is another one.
 
     See Also
     --------
@@ -182,9 +183,13 @@ def _voxels(
     image: Image | Content | None, mesh: Mesh | MeshFile, about: dict[str, Any]
 ) -> tuple[Image | None, Image | None, dict[str, Any]]:
     """Return the image with the voxels that count, the whole image, and the file's strings with one on the mask."""
-    if isinstance(image, Content):
-        texts = {} if image.own_mask is None else {MASK_TEXT: mask_text(image.own_mask)}
-        return image.own, image.given, texts | about
+    if isinstance(image, Content) and (mask := image.own_mask) is not None:
+        if isinstance(mesh, Mesh):
+            warn_of_other_mask(mesh, image)
+        elif n_other := count_of_other_voxels(mesh, mask):
+            warn(f"image: the content's mask differs in {n_other} voxels from the mask that the mesh was built within")
+        return image.own, image.given, {MASK_TEXT: mask_text(mask), **about}
+    image = image.own if isinstance(image, Content) else image
     within = None if image is None or isinstance(mesh, Mesh) else own_mask(mesh, image)
     return (image if image is None else continued(image, within)), image, about
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.align import resample_mask
-from tetopt.contents.domain import mask_of
+from tetopt.contents.domain import INSIDE_FRACTION, mask_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.interop import notebook
@@ -153,6 +153,12 @@ def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
     """Return a text from a file's field data, None if it is missing."""
     values = field_data.get(name, np.empty(0))
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
+
+
+def count_of_other_voxels(loaded: MeshFile, mask: Image) -> int:
+    """Return the number of voxels in which a mask differs from the one in a mesh's file; 0 if it contains none."""
+    own = own_mask(loaded, mask) if MASK_TEXT in loaded.field_data else None
+    return 0 if own is None else int(((own.data >= INSIDE_FRACTION) != (mask.data >= INSIDE_FRACTION)).sum())
 
 
 def own_mask(loaded: MeshFile, image: Image) -> Image | None:
