@@ -1,11 +1,11 @@
-"""Links, pipes and files of others in a cohort's folder: refused in a line with nothing touched, or of no harm."""
+"""Links and files of the user's in a cohort's folder: refused in a line with nothing touched, or of no harm."""
 
 import json
 import shutil
 
 import numpy as np
 import pytest
-from attacks import content, outside, planted
+from attacks import KINDS, content, outside, planted
 from cohorts import run_of, save_run, thumbnail
 from commands import assert_refused, exit_code
 
@@ -38,7 +38,6 @@ def out(tmp_path, image):
     save_run(out, KEY, run, thumbnail(rng))
     log_path(out, KEY).write_text("all went well")
     save_cohort_files(out, collect(out))
-    (out / ".work" / "lock").touch()
     return out
 
 
@@ -46,26 +45,11 @@ def words(out, *options):
     return ["cohort", out.parent / "t.tsv", "-o", out, *options]
 
 
-def pictures(out):
-    """Those that the page has, by the places of their subjects."""
-    page = (out / "cohort.html").read_text()
-    return json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}")
-
-
 ATTACKS = [
-    *((".work", kind) for kind in ("file link", "folder link", "pipe", "file")),
-    *((".work/lock", kind) for kind in ("hard link", "file link", "pipe", "folder")),
-    (".work/tetopt-manifest", "device link"), (".work/...run-1", "folder"), (".work/sub-01.lock", "file link"),
-    (".work/sub-01.run-1", "folder link"), (".work/other", "folder link"), (".work/run-1", "pipe"),
-    (".work/thesis.txt", "file"), (".work/thesis", "folder"),
-    *(("logs", kind) for kind in ("folder link", "file")),
-    *(("logs/sub-01.log", kind) for kind in ("file link", "pipe", "folder")),
-    *(("logs/sub-01.failed.json", kind) for kind in ("file link", "device link", "pipe")),
-    *(("logs/other.log", kind) for kind in ("file link", "pipe")),
-    *((f"cohort.{each}", kind) for each in ("tsv", "json", "html") for kind in ("hanging link", "pipe")),
-    *((f"{KEY}/{KEY}_desc-tetopt_mesh.json", kind) for kind in ("file link", "device link", "pipe")),
-    *((f"{KEY}/figures/thumbnail.png", kind) for kind in ("file link", "device link", "pipe")),
-    (f"{KEY}/figures", "folder link"),
+    *((".work", kind) for kind in KINDS),
+    *(("logs", kind) for kind in ("folder link", "hanging link")),
+    ("logs/sub-01.log", "file link"), ("logs/sub-01.failed.json", "device link"), ("logs/other.log", "file link"),
+    *((f"cohort.{each}", "hanging link") for each in ("tsv", "json", "html")),
 ]  # fmt: skip
 
 
@@ -87,24 +71,8 @@ def test_a_description_that_is_a_link_is_not_taken_for_a_cohorts(out, capfd):
     shutil.move(out / "dataset_description.json", elsewhere / "notes.txt")
     planted("file link", out / "dataset_description.json", elsewhere)
     before = content(out.parent)
-    assert_refused(capfd, words(out, "--collect"), "dataset_description.json: expected a regular file, got a link")
+    assert_refused(capfd, words(out, "--collect"), "dataset_description.json: expected no link")
     assert content(out.parent) == before
-
-
-def test_a_folder_of_a_version_without_manifests_is_refused(out, capfd):
-    (out / ".work" / "tetopt-manifest").unlink()
-    before = content(out.parent)
-    assert_refused(capfd, words(out, "--collect"), r"\.work: not a work directory of this version of tetopt")
-    assert content(out.parent) == before
-    shutil.rmtree(out / ".work")  # as the line advises
-    assert exit_code(*words(out, "--collect")) == 0
-
-
-def test_an_empty_work_directory_is_taken(out):
-    shutil.rmtree(out / ".work")
-    (out / ".work").mkdir()
-    for _ in range(2):
-        assert exit_code(*words(out, "--collect")) == 0
 
 
 def moved(out, place):
@@ -116,8 +84,9 @@ def moved(out, place):
     return elsewhere
 
 
-def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, monkeypatch):
-    elsewhere = moved(out, out / KEY)
+@pytest.mark.parametrize("name", [KEY, f"{KEY}/figures"])
+def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, monkeypatch, name):
+    elsewhere = moved(out, out / name)
     before = content(elsewhere)
     assert exit_code(*words(out, "--collect")) == 0
     with monkeypatch.context() as patch:  # what is asked for is what is there
@@ -126,9 +95,9 @@ def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, m
     assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
     whole = content(out.parent)
     assert exit_code(*words(out)) == 2
-    assert f"tetopt: {out / KEY}: expected the subject's folder, got a link to" in capfd.readouterr().err
+    assert f"tetopt: {out / name}: expected the subject's folder, got a link to" in capfd.readouterr().err
     assert content(out.parent) == whole
-    with pytest.raises(InputError, match=f"^{out / KEY}: expected the subject's folder"):
+    with pytest.raises(InputError, match=f"^{out / name}: expected the subject's folder"):
         publish(out / ".work" / "sub-01.run-1", out, KEY)
     assert content(elsewhere) == before
 
@@ -157,37 +126,39 @@ def test_links_that_a_user_has_put_beside_a_mesh_stay_links(out):
     assert content(elsewhere) == before
 
 
-def test_foreign_files_that_come_during_a_run_do_not_keep_it_from_its_end(out):
+def test_foreign_files_in_the_work_directory_stay(out):
+    elsewhere = outside(out.parent)
+    mine = {"thesis.txt": b"mine", "sub-01.run-3": str(elsewhere), "tetopt-lock": b""}
     (out / ".work" / "thesis.txt").write_text("mine")
     (out / ".work" / "sub-01.run-1").mkdir()
+    (out / ".work" / "sub-01.run-1" / "link").symlink_to(elsewhere)
+    (out / ".work" / "sub-01.run-3").symlink_to(elsewhere)
+    before = content(elsewhere)
     clean(out)
-    assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "tetopt-manifest", "thesis.txt"]
+    assert content(out / ".work") == mine
+    assert content(elsewhere) == before
 
 
-@pytest.mark.parametrize("kind", ["file link", "pipe", "folder link"])
-def test_a_picture_of_another_table_that_is_a_link_is_not_in_the_page(out, kind):
-    """Its subject is no subject of this run's, which therefore does not refuse it."""
-    (out.parent / "t.tsv").write_text("subject\timage\n02\tb.nii.gz\n")
-    assert exit_code(*words(out, "--collect")) == 1
-    assert len(pictures(out)) == 1
-    elsewhere, picture = outside(out.parent), thumbnail_path(out, KEY)
-    for name in ("notes.txt", picture.name):
-        (elsewhere / name).write_bytes(picture.read_bytes())
-    planted(kind, picture.parent if kind == "folder link" else picture, elsewhere)
-    assert exit_code(*words(out, "--collect")) == 1
-    assert pictures(out) == {}
-
-
-def test_a_picture_that_is_no_png_is_not_in_the_page(out):
-    thumbnail_path(out, KEY).write_text("a password")
-    assert exit_code(*words(out, "--collect")) == 0
-    assert pictures(out) == {}
-
-
-@pytest.mark.parametrize("kind", ["file link", "pipe"])
-def test_numbers_of_another_table_that_are_a_link_are_not_read(out, kind):
-    (out.parent / "t.tsv").write_text("subject\timage\n02\tb.nii.gz\n")
+def test_outputs_that_are_links_are_read_and_replaced(out, monkeypatch):
+    """As those of a folder under version control."""
     elsewhere = outside(out.parent)
-    (elsewhere / "notes.txt").write_bytes(numbers_path(out, KEY).read_bytes())
-    planted(kind, numbers_path(out, KEY), elsewhere)
-    assert collect(out, [KEY])[0].status in ("failed", "missing")
+    for number, path in enumerate((numbers_path(out, KEY), thumbnail_path(out, KEY))):
+        shutil.move(path, elsewhere / str(number))
+        path.symlink_to(elsewhere / str(number))
+    before = content(elsewhere)
+    assert exit_code(*words(out, "--collect")) == 0
+    page = (out / "cohort.html").read_text()
+    assert len(json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}")) == 1
+    work = out / ".work" / "sub-01.run-1"
+    (work / "figures").mkdir(parents=True)
+    for path in (numbers_path(out, KEY), thumbnail_path(out, KEY)):
+        (work / path.relative_to(out / KEY)).write_text("new")
+    publish(work, out, KEY)
+    assert numbers_path(out, KEY).read_text() == thumbnail_path(out, KEY).read_text() == "new"
+    assert not numbers_path(out, KEY).is_symlink()
+    assert content(elsewhere) == before
+
+
+def test_a_description_that_is_no_file_is_not_read(out, capfd):
+    planted("pipe", out / "dataset_description.json", outside(out.parent))
+    assert_refused(capfd, words(out, "--collect"), "is not a cohort folder")

@@ -1,13 +1,11 @@
-"""Places of a cohort's files: whose folder it is, who may write, and what a crash leaves."""
+"""Places of a cohort's files: whose folder it is, and what a crash leaves."""
 
 import json
 import os
-import subprocess
-import sys
 
 import pytest
 
-from tetopt.cohort.layout import begin, check_out, clean, locked, mesh_name, publish, subject_folder
+from tetopt.cohort.layout import begin, check_out, clean, mesh_name, publish, subject_folder
 from tetopt.errors import InputError
 
 
@@ -84,31 +82,9 @@ def test_what_ended_runs_have_left_is_removed(out):
     other = work_of(out, "sub-2", "another run's")
     (out / ".work" / "sub-1.lock").touch()
     clean(out, ["sub-1"])
-    assert sorted((out / ".work").iterdir()) == [out / ".work" / "sub-1.lock", other, out / ".work" / "tetopt-manifest"]
+    assert sorted((out / ".work").iterdir()) == [out / ".work" / "sub-1.lock", other, out / ".work" / "tetopt-lock"]
     clean(out)
     assert not other.exists()
-
-
-def locks(out, keys):
-    """Whether another process gets the lock."""
-    code = "import sys; from pathlib import Path; from tetopt.cohort.layout import locked\n"
-    code += "with locked(Path(sys.argv[1]), eval(sys.argv[2])): pass"
-    done = subprocess.run([sys.executable, "-c", code, str(out), repr(keys)], capture_output=True, text=True)
-    assert done.returncode == 0 or "another run is writing there (process" in done.stderr, done.stderr
-    return done.returncode == 0
-
-
-def test_two_runs_do_not_write_to_one_folder(out):
-    with locked(out):
-        assert not locks(out, None)
-        assert not locks(out, ["sub-1"])
-    assert locks(out, None)
-
-
-def test_runs_of_other_subjects_go_side_by_side(out):
-    with locked(out, ["sub-1", "sub-2"]):
-        assert locks(out, ["sub-3"])
-        assert not locks(out, ["sub-2"])
 
 
 def test_what_a_user_has_put_beside_a_mesh_stays(out):

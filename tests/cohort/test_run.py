@@ -136,7 +136,7 @@ def test_a_run_that_is_given_up_ends(task, monkeypatch):
     ended = run_subject(with_options(task, iterations=500))
     assert (ended.status, "No such file" in ended.reason) == ("failed", True)
     assert stages[-1] == "optimise"  # it does not go on to write
-    assert [each.name for each in (task.out / ".work").iterdir()] == ["tetopt-manifest"]
+    assert [each.name for each in (task.out / ".work").iterdir()] == ["tetopt-lock"]
     assert not subject_folder(task.out, "sub-1").exists()
 
 

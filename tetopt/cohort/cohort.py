@@ -17,8 +17,6 @@ from tetopt.cohort.layout import (
     clean,
     failure_path,
     linked_place,
-    locked,
-    not_our_files,
 )
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
@@ -41,6 +39,7 @@ from tetopt.job.options import RunOptions, kinds_of, near_hint
 from tetopt.job.plan import changed
 from tetopt.system.budget import memory_words
 from tetopt.system.files import checked_output
+from tetopt.system.work_directory import locked
 from tetopt.workers import SchedulerLost, check_workers, workers
 
 NAMED_FAILURES = 20  # reasons printed: the table and the page have all
@@ -156,13 +155,11 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
     if (place / WORK_NAME).is_dir() and cohort.write_table is None and not cohort.dry_run:
-        with locked(place, []):  # checked here as well, as planning many subjects takes minutes
+        with locked(place / WORK_NAME, []):  # checked here as well, as planning many subjects takes minutes
             pass
     rows = subjects_of(subjects, cohort)
     plan = CohortPlan(subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], {})
     if cohort.collect:
-        if problems := [wrong for each in plan.keys if (wrong := not_our_files(place, each)) is not None]:
-            raise Problems(problems)
         return plan
     entries = entries_of(rows, options, place, suffix)
     to_run = chosen(entries, cohort.retry_failed)
@@ -199,7 +196,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
     # Other runs may use the same folder.
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
     begin(place, [plan.subjects.absolute().as_uri()])
-    with locked(place, alone):
+    with locked(place / WORK_NAME, alone):
         clean(place, alone)
         # Again, as another run may have ended since.
         to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)

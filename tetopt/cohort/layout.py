@@ -1,4 +1,4 @@
-"""Layout of a cohort's files, with names of BIDS derivatives, and locks for writing.
+"""Layout of a cohort's files, with names of BIDS derivatives.
 
 OUT/dataset_description.json                   identifies the folder as a cohort's
 OUT/cohort.tsv, cohort.html                    all subjects
@@ -10,13 +10,10 @@ OUT/.work/                                     unfinished outputs (`tetopt.syste
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
-import stat
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +21,7 @@ import tetopt
 from tetopt.errors import InputError
 from tetopt.system import work_directory
 from tetopt.system.files import save_json
-from tetopt.system.incoming import irregular, json_of, own_bytes, text_of
-from tetopt.system.work_directory import LOCK_NAME, Layout, check_files, create, opened
+from tetopt.system.incoming import json_of, text_of
 
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
@@ -33,8 +29,6 @@ TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
 OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write to OUT
 BIDS_VERSION = "1.10.0"  # of the specification that names follow
 KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
-# Locks, and the unfinished outputs of subjects, which are not opened, only moved or removed.
-WORK = Layout("cohort", rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock", {rf"{KEY_PATTERN.pattern}\.run-[\w-]+": None})
 
 
 def subject_folder(out: Path, key: str) -> Path:
@@ -78,39 +72,17 @@ def check_out(out: Path) -> None:
         raise InputError(f"{out}: expected a folder for the cohort, got a file")
     if any(out.iterdir()) and not is_cohort(out):
         raise InputError(f"{out} is not a cohort folder; choose an empty folder, or that of a cohort")
-    for name in OWN_NAMES:
-        if (wrong := not_our_file(out / name)) is not None:
-            raise InputError(wrong)
-    if os.path.lexists(out / LOGS_NAME):
-        check_files(out / LOGS_NAME, "cohort")
+    for path in (*(out / name for name in (*OWN_NAMES, LOGS_NAME)), *(out / LOGS_NAME).glob("*")):
+        if path.is_symlink():
+            raise InputError(f"{path}: expected no link; replace it with what it leads to, or remove it")
     if os.path.lexists(out / WORK_NAME):
-        with opened(out / WORK_NAME, WORK) as work:
-            work.check()
-
-
-def not_our_file(path: Path) -> str | None:
-    """Return the problem of a file of tetopt's, if it is a link, a pipe or the like."""
-    other = irregular(path, follow=False) if os.path.lexists(path) else None
-    return other and f"{path}: expected a regular file, got {other}; replace it with the file itself, or remove it"
-
-
-def not_our_files(out: Path, key: str) -> str | None:
-    """Return the problem of a subject's outputs that are read."""
-    return not_our_file(numbers_path(out, key)) or not_our_picture(out, key)
-
-
-def not_our_picture(out: Path, key: str) -> str | None:
-    """Return the problem of a subject's thumbnail, and of its folder, which tetopt makes inside the subject's."""
-    path = thumbnail_path(out, key)
-    if path.parent.is_symlink():
-        return f"{path.parent}: expected a folder, got a link; replace it with the folder itself, or remove the link"
-    return not_our_file(path)
+        work_directory.check(out / WORK_NAME)
 
 
 def linked_place(out: Path, key: str) -> str | None:
     """Return the problem of a subject's folder that is a link, as a run would write to another place."""
     place = subject_folder(out, key)
-    for each in (place, place.parent):
+    for each in (place / FIGURES_NAME, place, place.parent):
         if each != out and each.is_symlink():
             return (
                 f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would write "
@@ -121,14 +93,7 @@ def linked_place(out: Path, key: str) -> str | None:
 
 def is_cohort(out: Path) -> bool:
     """Return whether `begin` made a folder."""
-    path = out / DESCRIPTION_NAME
-    if not path.is_file():
-        return False
-    try:
-        table = json_of(text_of(path, "description of a dataset"))
-    except ValueError:
-        return False
-    makers = table.get("GeneratedBy") if isinstance(table, dict) else None
+    makers = (table_in(out / DESCRIPTION_NAME) or {}).get("GeneratedBy")
     return isinstance(makers, list) and any(isinstance(each, dict) and each.get("Name") == "tetopt" for each in makers)
 
 
@@ -136,7 +101,7 @@ def begin(out: Path, sources: Sequence[str] = ()) -> None:
     """Make the folder if it is new, and describe its origin and data as a derivative of BIDS 1.10."""
     out.mkdir(exist_ok=True)
     (out / LOGS_NAME).mkdir(exist_ok=True)
-    create(out / WORK_NAME, WORK)
+    work_directory.create(out / WORK_NAME)
     if (out / DESCRIPTION_NAME).exists():
         return
     description = {
@@ -147,11 +112,6 @@ def begin(out: Path, sources: Sequence[str] = ()) -> None:
     save_json(out / DESCRIPTION_NAME, description)
     # BIDS does not yet name meshes of volumes, pages and logs; its patterns of folders have no "/".
     (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
-
-
-def locked(out: Path, keys: list[str] | None = None) -> AbstractContextManager[None]:
-    """Lock the folder against other runs, or, with `keys`, against runs that write the whole or these subjects."""
-    return work_directory.locked(out / WORK_NAME, WORK, out, keys)
 
 
 def publish(work: Path, out: Path, key: str) -> None:
@@ -176,16 +136,15 @@ def publish(work: Path, out: Path, key: str) -> None:
 
 def clean(out: Path, keys: list[str] | None = None) -> None:
     """Remove unfinished outputs of these subjects, or, without `keys`, of all: runs that go on elsewhere then end."""
-    with opened(out / WORK_NAME, WORK) as work:
-        for name, mode in work.own().items():
-            if stat.S_ISDIR(mode) and (keys is None or name.partition(".")[0] in keys):
-                work.remove(name, mode)
+    for path in (out / WORK_NAME).glob("sub-*.run-*"):
+        if (keys is None or path.name.partition(".")[0] in keys) and path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
 
 
-def numbers_of(path: Path) -> dict[str, Any] | None:
-    """Read a file of numbers; return None if it is missing, or was not written by a run of tetopt."""
+def table_in(path: Path) -> dict[str, Any] | None:
+    """Return the object in a JSON file; None if there is no such file, or something else in it."""
     try:
-        table = json.loads(own_bytes(path))
-    except (OSError, ValueError, RecursionError):
+        table = json_of(text_of(path, "JSON file"))
+    except (InputError, ValueError):
         return None
     return table if isinstance(table, dict) else None

@@ -20,10 +20,9 @@ from tetopt.cohort.layout import (
     LOGS_NAME,
     failure_path,
     log_path,
-    not_our_picture,
-    numbers_of,
     numbers_path,
     subject_folder,
+    table_in,
     thumbnail_path,
 )
 from tetopt.geometry.box import world_axes
@@ -118,17 +117,15 @@ def row_of(out: Path, key: str) -> Row:
         "thumbnail": thumbnail_path(out, key),
     }
     there = {name: path for name, path in places.items() if path.exists()}
-    if "thumbnail" in there and not_our_picture(out, key) is not None:
-        del there["thumbnail"]
     files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
     row = Row(key, subject, session, "missing", "not run yet", (), files, {}, {}, {}, {})
     if (path := failure_path(out, key)).exists():
-        failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
+        failure = table_in(path) or {"reason": f"{path.name} cannot be read"}
         own = {name: file for name, file in files.items() if name == "log"}  # the others belong to an older mesh
         return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), files=own)
     if "numbers" not in files:
         return row
-    run = numbers_of(places["numbers"])
+    run = table_in(places["numbers"])
     if run is None:
         return row._replace(status="failed", reason="its numbers cannot be read; run it again")
     return _row_of_run(out, row, run)

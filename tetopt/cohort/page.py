@@ -14,17 +14,13 @@ from urllib.parse import quote
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, label_quantities, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row, Value, description, present, save_table
-from tetopt.errors import InputError
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
-from tetopt.system.incoming import own_bytes
 
 PAGE_NUMBERS = 1_500_000  # in the page at most, about 10 MB: a browser on a phone reads them in seconds
 PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64; with more subjects, the flagged ones and a sample
 LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # per subject; the TSV table has all
-THUMBNAIL_BYTES = 32_768  # of one of tetopt's, at most: pictures of noise have half of that
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # other files are not embedded in the page
 SHOWN_DIGITS = 4  # of numbers in the page
 LISTED_VALUES = 6  # of an option that differs; with more, only their number is shown
 PICTURE_WORDS = "axial, with the patient's left on the left, and sagittal, with the back on the left"
@@ -164,10 +160,8 @@ def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -
     chosen = chain(odd[:n_odd], (rest[k * len(rest) // n_rest] for k in range(n_rest)))
     pictures: list[str | None] = [None] * len(rows)
     for place in chosen:
-        with suppress(OSError, InputError):  # the page does without it
-            png = own_bytes(out / rows[place].files["thumbnail"], THUMBNAIL_BYTES)
-            if png.startswith(PNG_SIGNATURE):
-                pictures[place] = base64.b64encode(png).decode("ascii")
+        with suppress(OSError):  # the page does without it
+            pictures[place] = base64.b64encode((out / rows[place].files["thumbnail"]).read_bytes()).decode("ascii")
     return pictures
 
 

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cohort.layout import mesh_name, not_our_files, numbers_path
+from tetopt.cohort.layout import mesh_name, numbers_path
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState, state_of
 from tetopt.cohort.subjects import (
@@ -109,8 +109,6 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
             problems.append((subject.place, str(error)))
             continue
         problems += [(subject.place, words) for words in _missing(plan.job)]
-        if (wrong := not_our_files(out, key(subject))) is not None:
-            problems.append(("", wrong))
         entries.append(PlannedSubject(subject, key(subject), plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from tetopt.cohort.layout import failure_path, mesh_name, numbers_of, numbers_path, subject_folder
+from tetopt.cohort.layout import failure_path, mesh_name, numbers_path, subject_folder, table_in
 from tetopt.cohort.subjects import IMAGE_PATTERN
 
 Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": the mesh violates a requirement
@@ -31,8 +31,8 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     request : dict, optional
         The current request, from `tetopt.job.request.requested`; without it, existing outputs are not compared.
     """
-    numbers = numbers_of(numbers_path(out, key))
-    failure = numbers_of(failure_path(out, key))
+    numbers = table_in(numbers_path(out, key))
+    failure = table_in(failure_path(out, key))
     before = _request_of(numbers or {})
     mesh = subject_folder(out, key) / mesh_name(key, str(before["options"].get("format", suffix)))
     is_there = numbers is not None and mesh.is_file() and mesh.stat().st_size > 0

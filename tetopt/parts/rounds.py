@@ -39,7 +39,6 @@ from tetopt.parts.work import (
     gone_if_refused,
     load_arrays,
     load_state,
-    locked,
     mesh_path,
     open_volume,
     round_folder,
@@ -49,6 +48,7 @@ from tetopt.parts.work import (
 )
 from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
+from tetopt.system.work_directory import locked
 
 MOST_CELLS = 100_000  # in a part: 17,000 nodes, a tenth to a fifth of them shared, and some seconds per round
 MOST_VOXELS = 2**25  # in the cells of a part, 34 million: with sums less than 1.5 GB

@@ -6,20 +6,19 @@ mesh-R.npz                    the mesh after round R, only of the last round
 round-R/part-P.npz            the input of a part of the next round
 round-R/done-P.npz            its result
 
-`tetopt.system.work_directory` rejects all other entries.
+Other entries stay, see `tetopt.system.work_directory`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import struct
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,17 +30,12 @@ from tetopt.image import Image
 from tetopt.io.images import Bounds
 from tetopt.io.stored_images import open_stored, stored_checksum
 from tetopt.io.text import plain
-from tetopt.system import work_directory
 from tetopt.system.files import save_json, written_whole
-from tetopt.system.incoming import json_of, own_bytes
-from tetopt.system.work_directory import LOCK_NAME, Layout, create, discard
+from tetopt.system.work_directory import create, discard
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
-LAYOUT = Layout(
-    "a mesh in parts",
-    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz",
-    {r"round-\d+": r"(part|done)-\d+\.npz"},
-)
+FILE_NAMES = (VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME, "mesh-*.npz")
+PART_NAMES = ("part-*.npz", "done-*.npz")  # in the folder of a round
 TEXT_NAME = "text"  # entry of a file of arrays with further information, in JSON
 
 
@@ -66,14 +60,11 @@ class VolumeFile(NamedTuple):
             return open_stored(self.path, volume=self.volume, crop=self.crop)
 
 
-def locked(folder: Path) -> AbstractContextManager[None]:
-    """Lock the work directory for a single run; see `tetopt.system.work_directory.locked`."""
-    return work_directory.locked(folder, LAYOUT, folder)
-
-
 def removed(folder: Path) -> list[str]:
     """Remove the work directory; return the names of entries that are not tetopt's, which remain."""
-    return discard(folder, LAYOUT)
+    for each in folder.glob("round-*"):
+        discard(each, PART_NAMES)
+    return discard(folder, FILE_NAMES)
 
 
 @contextmanager
@@ -105,7 +96,7 @@ def identity(file: VolumeFile | None, sha256: str) -> tuple[str, str | None]:
 
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
     """Record the location of the voxels, or save those of an image in memory to the folder, to be mapped from there."""
-    create(folder, LAYOUT)
+    create(folder)
     if isinstance(volume, Image):
         with written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary, temporary.open("wb") as stream:
             np.save(stream, volume.data)
@@ -119,7 +110,7 @@ def open_volume(folder: Path) -> Image:
     """Open the image of a work directory; InputError for the reasons of `open_stored`, or if the folder is damaged."""
     path = folder / VOLUME_NAME
     try:
-        words = json_of(own_bytes(path).decode())
+        words = json.loads(path.read_text("utf-8"))
         if words["path"] is None:
             path = folder / VOXELS_NAME
             return Image.stored(np.load(path, mmap_mode="r"), words["affine"])
@@ -183,7 +174,7 @@ def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None
             old.unlink()
     for old in folder.glob("round-*"):
         if old != round_folder(folder, state.n_rounds):
-            shutil.rmtree(old)
+            discard(old, PART_NAMES)
 
 
 def load_state(folder: Path, request: str) -> WorkState | None:
@@ -198,7 +189,7 @@ def load_state(folder: Path, request: str) -> WorkState | None:
     if not path.exists():
         return None
     try:
-        words = json_of(own_bytes(path).decode())
+        words = json.loads(path.read_text("utf-8"))
         state = WorkState(**words["state"])
         if words["checksum"] != checksum({}, state._asdict()):
             raise ValueError("its checksum does not match")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import stat
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -20,8 +19,6 @@ KINDS_OF_FILES = {
     stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link",
 }  # fmt: skip
-# Flags with which tetopt opens its own files: links are not followed, pipes do not block. Windows has neither flag.
-UNFOLLOWED = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def irregular(path: Path, *, follow: bool = True) -> str | None:
@@ -64,25 +61,6 @@ def regular_file(path: str | Path, noun: str) -> Path:
     if other is not None:
         raise InputError(f"{path}: expected a regular file, got {other}; copy its data into a file")
     return path
-
-
-def own_bytes(path: Path, most_bytes: int = TEXT_BYTES) -> bytes:
-    """Return the content of a file that tetopt wrote; links are not followed, as tetopt creates none.
-
-    Raises
-    ------
-    OSError
-        The file does not exist or cannot be read.
-    InputError
-        It is a link, is not a regular file, or has more than `most_bytes` bytes.
-    """
-    if (other := irregular(path, follow=False)) is not None:
-        raise InputError(f"{path}: expected a regular file, got {other}; replace it with the file itself, or remove it")
-    with open(os.open(path, os.O_RDONLY | UNFOLLOWED), "rb") as stream:
-        whole = stream.read(most_bytes + 1)
-    if len(whole) > most_bytes:
-        raise InputError(f"{path}: expected at most {most_bytes} bytes, got {_size(path)}; remove it")
-    return whole
 
 
 def text_of(path: str | Path, noun: str) -> str:
