@@ -10,9 +10,11 @@ from io import BytesIO
 from pathlib import Path
 
 import numba
+import PIL.Image
 import pytest
 import schemas
 from hypothesis import settings
+from matplotlib.figure import Figure
 from order import LONGEST_FILES
 
 import tetopt.system.files
@@ -36,6 +38,37 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def wide_lines(monkeypatch):
     """Sentences on one line, as tests look for parts of them; `test_cli_width.py` has lines as users see them."""
     monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
+
+
+# Of the test that runs, or whose fixtures are made, those of a module among them.
+marks: set[str] = set()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    marks.clear()
+    marks.update(mark.name for mark in item.iter_markers())
+    if "assert_refused" in item.fixturenames:
+        marks.add("apart")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def blank_pictures():
+    """Figures are composed, and written blank where no test looks at them, as drawing one takes half a second.
+
+    Tests marked `drawn` look at them.
+    """
+    drawn = Figure.savefig
+
+    def saved(figure, path, **options):
+        if marks & {"drawn", "deep", "slow"}:
+            drawn(figure, path, **options)
+        else:
+            PIL.Image.new("RGB", (8, 6)).save(path, "png")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", saved)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -86,29 +119,29 @@ def scheduler():
         yield cluster.scheduler_address
 
 
-@pytest.fixture(autouse=True)
-def read_here(monkeypatch, request):
+@pytest.fixture(scope="session", autouse=True)
+def read_here():
     """Files are read in this process, where a test is not of the child that reads them, which takes half a second.
 
     Marked `apart`, or with the fixture `assert_refused`, are tests of the child, and of files at which libraries may
     end the process.
     """
-    is_apart = any(request.node.get_closest_marker(name) for name in ("apart", "deep", "slow"))
-    if is_apart or "assert_refused" in request.fixturenames:
-        yield
-        return
+    of_child = apart._of_child
 
-    def answered(job, _seconds):
+    def answered(job, seconds):
+        if marks & {"apart", "deep", "slow"}:
+            return of_child(job, seconds)
+        vtk = sys.modules.get("vtkmodules.vtkCommonCore")  # its readers' words go where they went before
+        window = None if vtk is None else vtk.vtkOutputWindow.GetInstance()
         stream = BytesIO()
         with warnings.catch_warnings(action="ignore"):  # which nobody hears in a child
             apart._sent(stream, apart._answer(job))
+        if window is not None:
+            vtk.vtkOutputWindow.SetInstance(window)
         stream.seek(0)
         return apart._received(stream), 0
 
-    monkeypatch.setattr(apart, "_of_child", answered)
-    monkeypatch.setattr(apart, "limit_self", lambda *_: None)
-    vtk = sys.modules.get("vtkmodules.vtkCommonCore")  # its readers' words go where they went before
-    window = None if vtk is None else vtk.vtkOutputWindow.GetInstance()
-    yield
-    if window is not None:
-        vtk.vtkOutputWindow.SetInstance(window)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(apart, "_of_child", answered)
+        patch.setattr(apart, "limit_self", lambda *_: None)
+        yield

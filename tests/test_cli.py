@@ -759,6 +759,7 @@ def test_a_4d_file_needs_a_volume(tmp_path, data_dir, capfd):
 # demo
 
 
+@pytest.mark.drawn
 def test_demo(tmp_path):
     pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
     folder = tmp_path / "new" / "demo"

@@ -9,7 +9,7 @@ import tetopt
 from tetopt.measure.fidelity import cell_labels
 from tetopt.report.colours import label_colours
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.drawn]
 
 TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
 cut_open = script("cut_open")

@@ -46,6 +46,7 @@ def test_figures_have_captions_and_words_for_those_who_cannot_see_them():
     assert n_figures >= len(drawing.PICTURES)
 
 
+@pytest.mark.drawn
 def test_a_drawing_is_written_once(tmp_path, capsys):
     """An existing picture is replaced only by --force; what is written is a picture of a few colours."""
     arguments = ["-o", str(tmp_path), "--only", "shapes"]

@@ -561,10 +561,14 @@ def run():
     return image, initial, optimize_paper(image, initial, iterations=2)
 
 
+@pytest.mark.drawn
 def test_pictures_are_written_and_not_blank(tmp_path, run):
     image, initial, result = run
-    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png")]
-    save_run_figures(paths, image, initial, result)
+    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png", "boundary.png", "labels.png")]
+    save_run_figures(paths[:3], image, initial, result)
+    domain = Image(image.data / 9.0)
+    save_figure(boundary_figure(image, domain, result.mesh), paths[3])
+    save_figure(label_figure(image, result.mesh, cell_labels(image, result.mesh)), paths[4])
     for path in paths:
         with PIL.Image.open(path) as picture:
             assert picture.format == "PNG"
