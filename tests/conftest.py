@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 
@@ -13,12 +14,15 @@ import numba
 import PIL.Image
 import pytest
 import schemas
+import typer
 from hypothesis import settings
 from matplotlib.figure import Figure
 from order import LONGEST_FILES
 
 import tetopt.system.files
+from tetopt.cli import app
 from tetopt.io import apart
+from tetopt.report import summary
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
@@ -38,6 +42,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def wide_lines(monkeypatch):
     """Sentences on one line, as tests look for parts of them; `test_cli_width.py` has lines as users see them."""
     monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def built_once():
+    """The line of each command is built once, and versions are looked up once: that takes longer than most commands."""
+    build, built = app._app, {}
+
+    def kept(arguments):
+        name = next((word for word in arguments if not word.startswith("-")), None)
+        if name in built and name in app.COMMANDS:
+            app._check_environment()
+        elif name not in built:
+            built[name] = typer.main.get_command(build(arguments))
+        return built[name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(app, "_app", kept)
+        patch.setattr(summary, "version", cache(summary.version))
+        yield
 
 
 # Of the test that runs, or whose fixtures are made, those of a module among them.
