@@ -1,6 +1,5 @@
 """Units of headers, and headers that state two places, sides or sizes: one is used, both are told."""
 
-import json
 import re
 import warnings
 
@@ -253,22 +252,3 @@ def test_two_statements_of_nrrd(tmp_path, name):
 def test_statements_that_nrrd_excludes(tmp_path, fields, told):
     with pytest.raises(InputError, match=".*".join(re.escape(part) for part in told.split(".*"))):
         load_image(nrrd(tmp_path, fields))
-
-
-def test_affine_of_zarr_beside_its_scale(tmp_path):
-    pytest.importorskip("zarr")
-    from tetopt.io.images import save_image
-
-    save_image(tmp_path / "a.zarr", load_image(nifti(tmp_path, moved([0, 0, 7]), STEPS, (1, 0))))
-    assert read(tmp_path / "a.zarr")[1] == []
-    file = tmp_path / "a.zarr" / "zarr.json"
-    table = json.loads(file.read_text())
-    scale = table["attributes"]["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]
-    scale["scale"] = [1.0, 2.0, 6.0]
-    file.write_text(json.dumps(table))
-    image, said = read(tmp_path / "a.zarr")
-    assert image.spacing.tolist() == [1.0, 2.0, 3.0]
-    assert said == [
-        'its attribute "affine" has voxels of 1 x 2 x 3 mm at (0, 0, 7), its scale and translation voxels of 1 x 2 x 6 '
-        "mm at (0, 0, 7); the first is used, check it"
-    ]

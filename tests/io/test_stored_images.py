@@ -376,40 +376,39 @@ def set_in(*keys):
 
 
 PLACE = ("datasets", 0, "coordinateTransformations")
+OTHER = r"its OME-Zarr metadata does not follow NGFF 0\.4 or 0\.5 \("
+MISSING = "its Zarr metadata cannot be read .*; copy it again"
 BAD_METADATA = {
     "no multiscales": (lambda _, table: table["attributes"].clear(), "this Zarr group has no OME-Zarr image .* 0"),
     "empty": (lambda _, table: table["attributes"]["ome"].update(multiscales=[]), "has no OME-Zarr image"),
     "attributes of another kind": (lambda _, table: table["attributes"].update(ome=[1]), "has no OME-Zarr image"),
-    "no datasets": (set_in("datasets", []), "datasets: expected a list of its arrays, got \\[\\]"),
-    "many datasets": (set_in("datasets", [{}] * 65), "datasets: expected"),
-    "NGFF 0.3": (set_in("axes", ["z", "y", "x"]), "axes: expected a list of axes with names, as in NGFF 0.4 and 0.5"),
-    "NGFF 0.6": (lambda scales, _: scales.pop("axes"), "axes: expected .* got None"),
+    "no datasets": (set_in("datasets", []), OTHER),
+    "empty datasets": (set_in("datasets", [{}] * 65), f"{OTHER}KeyError: 'path'"),
+    "NGFF 0.3": (set_in("axes", ["z", "y", "x"]), OTHER),
+    "NGFF 0.2": (lambda scales, _: scales.pop("axes"), f"{OTHER}KeyError: 'axes'"),
     "too few axes": (set_in("axes", axes_of("xyz")[:2] + axes_of("c")), "expected three spatial axes, got 2"),
     "too many axes": (set_in("axes", axes_of("txyz")), "has 4 axes, its array 3"),
     "axes of other names": (
         set_in("axes", [dict(each, name="q", orientation=None) for each in axes_of("xyz")]),
-        "names of axes: expected x, y and z",
+        "axes: expected x, y and z, or three different orientations, got q, q, q",
     ),
-    "one direction twice": (set_in("axes", axes_of("xyx")), "orientation: expected three different directions"),
+    "one direction twice": (set_in("axes", axes_of("xyx")), "expected x, y and z, or three different orientations"),
     "unit": (set_in("axes", axes_of("xyz", "second")), 'unit: expected a length such as "mm" or "um", got "second"'),
-    "unit of no text": (set_in("axes", axes_of("xyz", ["mm"])), "unit: expected"),
+    "unit of no text": (set_in("axes", axes_of("xyz", ["mm"])), OTHER),
     "no scale": (set_in(*PLACE, []), "has no scale"),
-    "a file of scales": (set_in(*PLACE, [{"type": "scale", "path": "x"}]), "scale: expected 3 numbers, got None"),
-    "short scale": (set_in(*PLACE, transforms([1, 1])), "scale: expected 3 numbers"),
-    "scale of texts": (set_in(*PLACE, transforms(["1", "1", "1"])), "scale: expected 3 numbers"),
+    "a file of scales": (set_in(*PLACE, [{"type": "scale", "path": "x"}]), f"{OTHER}KeyError: 'scale'"),
+    "short scale": (set_in(*PLACE, transforms([1, 1])), OTHER),
+    "scale of texts": (set_in(*PLACE, transforms(["a", "1", "1"])), OTHER),
     "scale of nothing": (set_in(*PLACE, transforms([0, 1, 1])), "affine: it is singular"),
-    "scale beyond floats": (set_in(*PLACE, transforms([float("inf"), 1, 1])), "scale: expected 3 numbers"),
-    "whole number beyond floats": (set_in(*PLACE, transforms([10**400, 1, 1])), "scale: expected 3 numbers"),
-    "rotation": (set_in(*PLACE, [{"type": "rotation"}]), "expected scales and translations, got 'rotation'"),
-    "way out": (set_in("datasets", 0, "path", "../b.zarr"), "path: expected the name of an array within the folder"),
-    "absolute": (set_in("datasets", 0, "path", "/etc"), "path: expected the name"),
-    "no path": (set_in("datasets", 0, {}), "path: expected the name"),
-    "link to elsewhere": (set_in("datasets", 0, "path", "s3://a/b"), "path: expected the name"),
-    "array that is not there": (
-        set_in("datasets", 0, "path", "no\nthing"),
-        re.escape(r'its array "no\nthing" is missing'),
-    ),
-    "group in place of an array": (set_in("datasets", 0, "path", "."), "path: expected"),
+    "scale beyond floats": (set_in(*PLACE, transforms([float("inf"), 1, 1])), "affine: expected finite"),
+    "whole number beyond floats": (set_in(*PLACE, transforms([10**400, 1, 1])), OTHER),
+    "rotation": (set_in(*PLACE, [{"type": "rotation"}]), "expected scales and translations, got rotation"),
+    "way out": (set_in("datasets", 0, "path", "../b.zarr"), MISSING),
+    "absolute": (set_in("datasets", 0, "path", "/etc"), MISSING),
+    "no path": (set_in("datasets", 0, {}), f"{OTHER}KeyError: 'path'"),
+    "link to elsewhere": (set_in("datasets", 0, "path", "s3://a/b"), MISSING),
+    "array that is not there": (set_in("datasets", 0, "path", "no\nthing"), MISSING),
+    "group in place of an array": (set_in("datasets", 0, "path", ""), OTHER),
 }
 
 
@@ -441,7 +440,7 @@ def test_metadata_that_is_damaged(tmp_path, name, text):
         ({"dtype": "S3"}, r"expected one real number per voxel, got \|S3"),
         ({"dtype": [("r", "u1"), ("g", "u1")]}, "expected one real number per voxel, got .*'r'"),
         ({"compressors": [numcodecs.Pickle()], "dtype": "i2"}, "pickle"),
-        ({"filters": [numcodecs.Base64()], "dtype": "i2"}, "unsupported codecs in its chunks: base64"),
+        ({"filters": [numcodecs.Pickle()], "dtype": "i2"}, "pickle"),
         ({"filters": [numcodecs.Delta("i2")], "dtype": "i2"}, None),
         ({"compressors": [numcodecs.LZ4()], "dtype": "i2"}, None),
         ({"chunks": (1, 1, 1), "dtype": "i2"}, None),
@@ -483,7 +482,7 @@ def test_arrays_by_themselves(tmp_path):
         array.attrs["affine"] = affine
         assert_refused(tmp_path / "a", match, volume=1)
     zarr.create_array(tmp_path / "b.zarr", shape=(3, 4), dtype="i2")
-    assert_refused(tmp_path / "b.zarr", r"expected an array with three axes, got shape \(3, 4\)")
+    assert_refused(tmp_path / "b.zarr", r"expected 3 to 32 axes with voxels, got shape \(3, 4\)")
 
 
 def test_chunks_that_cannot_be(tmp_path, monkeypatch):
@@ -499,7 +498,10 @@ def test_chunks_that_cannot_be(tmp_path, monkeypatch):
     os.mkfifo(chunk)
     assert_refused(path, "its chunk c/1/0/0 is not a regular file")
     chunk.unlink()
-    assert_refused(path, "1 of its 2 chunks are missing, and it has no fill value")
+    with pytest.warns(UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, nan"):
+        image = open_stored(path)
+    with pytest.raises(InputError, match="64 voxels are NaN or infinite"):
+        image.box((0, 0, 0), image.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         open_stored(path, crop=[(0, 4), (0, 4), (0, 4)])  # which do not need it

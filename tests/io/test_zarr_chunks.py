@@ -17,7 +17,7 @@ from tetopt.io.stored_images import open_stored
 
 VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
 PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
-LINE = "its voxels .* cannot be read|zarr crashed|more than 2.1 GB of memory"
+LINE = "its voxels .* cannot be read|its chunk .* copy it again|zarr crashed|more than 2.1 GB of memory"
 SLOW = pytest.mark.slow
 pytestmark = [
     pytest.mark.apart,
@@ -119,11 +119,10 @@ def changed(path, fmt, **values):
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"chunks": [0, 4, 4]}, "expected voxels along every axis|chunk shape .* is invalid"),
-        ({"shape": [1] * 62 + [10] * 3, "chunks": [1] * 62 + [4] * 3}, "expected at most 32 axes, got 65"),
+        ({"chunks": [0, 4, 4]}, "expected 3 to 32 axes with voxels|chunk shape .* is invalid"),
+        ({"shape": [1] * 62 + [10] * 3, "chunks": [1] * 62 + [4] * 3}, "expected 3 to 32 axes"),
         ({"shape": [2000] * 3}, "expected at most 16777216 chunks, got 125000000|memory"),
         ({"shape": [10**6] * 3, "chunks": [10**6] * 3}, "one of its chunks .* memory"),
-        ({"shape": [3200] * 3, "chunks": [100] * 3}, "only 27 of its 32768 chunks exist|memory"),
     ],
 )
 def test_metadata_that_promises_too_much(tmp_path, fmt, values, words):
@@ -138,4 +137,4 @@ def test_a_chunk_of_any_length(tmp_path):
     chunk = written(tmp_path / "a.zarr", 2, compressors=None)
     with chunk.open("r+b") as file:
         file.truncate(2**40)  # a hole, which takes no room
-    refused(tmp_path / "a.zarr", "its chunk 0.0.0 has 1099511627776 bytes")
+    refused(tmp_path / "a.zarr", "its chunk 0.0.0 is not a regular file of at most")
