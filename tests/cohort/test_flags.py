@@ -7,19 +7,15 @@ import pytest
 from cohorts import run_of, save_cohort
 
 from tetopt.cohort.flags import FEW_SUBJECTS, deviations, flags_of, limit, unjudged
-from tetopt.cohort.numbers import Row, collect, flattened
+from tetopt.cohort.numbers import Row, collect, with_numbers
 
 OBLIQUE = np.diag([1.0, 1.0, 1.2, 1.0])
 OBLIQUE[:3, :3] = [[0.9, -0.436, 0.0], [0.436, 0.9, 0.0], [0.0, 0.0, 1.2]]
 
 
 def row_of(k, run, **changes):
-    labels = run["labels"]
-    row = Row(
-        f"sub-{k}", f"sub-{k}", "", "done", "", (), {}, flattened(run), {17: "hippocampus"},
-        {each["label"]: each["volume"] for each in labels}, {each["label"]: 350 for each in labels if each["is_lost"]},
-    )  # fmt: skip
-    return row._replace(**changes)
+    row = Row(f"sub-{k}", f"sub-{k}", "", "done", "", (), {}, {}, {}, {}, {})
+    return with_numbers(row, run | {"label_names": {"17": "hippocampus"}})._replace(**changes)
 
 
 def flagged(odd, n=20, **changes):
@@ -37,7 +33,7 @@ def test_each_kind_of_odd_subject():
     assert flagged({}) == []
     flipped = {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}
     assert flagged(flipped) == [("grid.orientation", "orientation LPS: 19 of 20 have RAS")]
-    assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): it has 350 voxels but no cell")]
+    assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): it has 3992 voxels but no cell")]
     assert flagged({"lost": 17}, violated=("labels",)) == flagged({"lost": 17})  # told once
     assert flagged({"absent": 53}) == [("label", "no label 53 in its image: 19 of 20 have it")]
     assert flagged({}, violated=("min_dihedral",)) == [("violated", "violated min_dihedral")]

@@ -60,7 +60,7 @@ def test_exit_code_and_files_and_cohort_agree(inputs, tmp_path, monkeypatch, cap
         assert sentence.replace("`", "")[:40].split(";")[0] in said.err.replace("`", ""), key_of
     row = row_of(tmp_path, key)
     assert (row.status, row.violated) == ("violated", tuple(violated))
-    assert state_of(tmp_path, key, ".vtu", None).status == "violated"
+    assert state_of(tmp_path, key).status == "violated"
     (flags,) = flags_of([row])
     assert {flag.column for flag in flags} <= {"violated", "label"}
     assert len(flags) >= 1

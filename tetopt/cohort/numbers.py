@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import chain
-from math import isfinite
 from pathlib import Path
 from sys import intern
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tetopt.cohort.layout import (
-    FIGURES_NAME,
     KEY_PATTERN,
     LOGS_NAME,
     failure_path,
     log_path,
     numbers_path,
-    subject_folder,
     table_in,
     thumbnail_path,
 )
+from tetopt.cohort.state import Status, mesh_of, state_of
 from tetopt.geometry.box import world_axes
 from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole
 from tetopt.system.incoming import toml_of
 
-Status = Literal["done", "violated", "failed", "missing"]
 Value = float | int | str | bool | None
 # Parts of run.json that are not in the table: rows by iteration; sizes of sets, as `labels` has those of labels; pairs
 # of labels, as there are sums; names and loads as texts; values with columns of other names; the sentences in
@@ -45,7 +42,6 @@ NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 OBLIQUE_DIGITS = 1  # of degrees: the precision of an affine's float32 numbers
 COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
-LARGEST_COUNT = 2**63  # of whole numbers: larger ones are not counts
 
 
 class Row(NamedTuple):
@@ -54,8 +50,7 @@ class Row(NamedTuple):
     key: str  # "sub-01_ses-a"
     subject: str  # "sub-01"
     session: str  # "ses-a", or ""
-    # violated: the mesh violates a requirement; missing: expected, with neither a mesh nor a failure
-    status: Status
+    status: Status  # never "changed"
     reason: str  # failure or violated requirements, on one line; "" for a subject that is done
     violated: tuple[str, ...]  # the names of these requirements
     files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": existing paths, relative to OUT
@@ -65,14 +60,14 @@ class Row(NamedTuple):
     n_lost: dict[int, int]  # voxels of its labels without a cell
 
 
-def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
+def collect(out: Path, expected: Sequence[str] = ()) -> list[Row]:
     """Collect the rows of all subjects in a cohort's folder, and of expected ones, in the order of their names.
 
     Parameters
     ----------
     out : Path
         A cohort's folder: `sub-X[/ses-Y]/sub-X[_ses-Y]_desc-tetopt_mesh.json`, `logs/`.
-    expected : sequence of str, optional
+    expected : sequence of str
         Keys, as "sub-01_ses-a".
 
     Returns
@@ -80,7 +75,13 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     list of Row
         A subject with unreadable files counts as failed. If a run failed, the numbers of an older mesh are left out.
     """
-    keys = {*_keys_there(out), *(expected or ())}
+    keys = set(expected)
+    for path_of, folder in ((numbers_path, "sub-*"), (numbers_path, "sub-*/ses-*"), (failure_path, LOGS_NAME)):
+        ending = path_of(out, "").name
+        for path in out.glob(f"{folder}/sub-*{ending}"):
+            key = path.name.removesuffix(ending)
+            if KEY_PATTERN.fullmatch(key) and path == path_of(out, key):
+                keys.add(key)
     return [row_of(out, key) for key in sorted(keys, key=natural_order)]
 
 
@@ -89,73 +90,31 @@ def natural_order(text: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
-def _keys_there(out: Path) -> Iterator[str]:
-    """Yield the keys of subjects with numbers or a failure in the cohort's folder."""
-    for folder in _folders(out, "sub-"):
-        for place in (folder, *_folders(folder, "ses-")):
-            key = folder.name if place == folder else f"{folder.name}_{place.name}"
-            if KEY_PATTERN.fullmatch(key) and numbers_path(out, key).is_file():
-                yield key
-    ending = failure_path(out, "").name
-    for path in (out / LOGS_NAME).iterdir() if (out / LOGS_NAME).is_dir() else ():
-        key = path.name.removesuffix(ending)
-        if path.name.endswith(ending) and KEY_PATTERN.fullmatch(key):
-            yield key
-
-
-def _folders(folder: Path, beginning: str) -> list[Path]:
-    return [path for path in folder.iterdir() if path.name.startswith(beginning) and path.is_dir()]
-
-
 def row_of(out: Path, key: str) -> Row:
     """Return the row of one subject, by its key; see `collect`."""
     subject, _, session = key.partition("_")
-    places = {
-        "numbers": numbers_path(out, key),
-        "log": log_path(out, key),
-        "figures": subject_folder(out, key) / FIGURES_NAME,
-        "thumbnail": thumbnail_path(out, key),
-    }
-    there = {name: path for name, path in places.items() if path.exists()}
-    files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
-    row = Row(key, subject, session, "missing", "not run yet", (), files, {}, {}, {}, {})
-    if (path := failure_path(out, key)).exists():
-        failure = table_in(path) or {"reason": f"{path.name} cannot be read"}
-        own = {name: file for name, file in files.items() if name == "log"}  # the others belong to an older mesh
-        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), files=own)
-    if "numbers" not in files:
-        return row
-    run = table_in(places["numbers"])
-    if run is None:
-        return row._replace(status="failed", reason="its numbers cannot be read; run it again")
-    return _row_of_run(out, row, run)
+    status, reason = state_of(out, key)
+    places = {"log": log_path(out, key)}
+    row = Row(key, subject, session, status, reason, (), {}, {}, {}, {}, {})
+    if status in ("done", "violated"):
+        numbers = numbers_path(out, key)
+        places |= {"mesh": mesh_of(out, key) or numbers, "numbers": numbers, "thumbnail": thumbnail_path(out, key)}
+        places["figures"] = places["thumbnail"].parent
+        row = with_numbers(row, table_in(numbers) or {})
+    files = {name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()}
+    return row._replace(files=files)
 
 
-def _row_of_run(out: Path, row: Row, run: dict[str, Any]) -> Row:
-    """Return the row with the numbers of run.json and the violated requirements."""
-    path = numbers_path(out, row.key)
-    meshes = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json")
-    mesh = min(meshes, default=None)
-    if mesh is None:
-        return row._replace(status="failed", reason="its numbers exist, but its mesh is missing; run it again")
-    violated = run["violated"] if isinstance(run.get("violated"), dict) else {}
-    labels = [each for each in _table(run, "labels") if isinstance(each.get("label"), int)]
-    names = run["label_names"] if isinstance(run.get("label_names"), dict) else {}
+def with_numbers(row: Row, run: dict[str, Any]) -> Row:
+    """Return the row with the numbers of run.json."""
+    labels, names = run.get("labels") or [], run.get("label_names") or {}
     return row._replace(
-        status="violated" if violated else "done",
-        reason="; ".join(f"{plain(name)}: {plain(str(words))}" for name, words in violated.items()),
-        violated=tuple(plain(name) for name in violated),
-        files={"mesh": mesh.relative_to(out).as_posix(), **row.files},
+        violated=tuple(map(plain, run.get("violated") or {})),
         numbers=flattened(run),
-        label_names={int(number): plain(str(name)) for number, name in names.items() if number.isdecimal()},
-        volumes={each["label"]: each["volume"] for each in labels if present([_scalar(each.get("volume"))])},
-        n_lost={each["label"]: each.get("voxels") or 0 for each in labels if each.get("is_lost") is True},
+        label_names={int(number): plain(name) for number, name in names.items()},
+        volumes={each["label"]: each["volume"] for each in labels},
+        n_lost={each["label"]: each["voxels"] for each in labels if each["is_lost"]},
     )
-
-
-def _table(run: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    rows = run.get(name)
-    return [each for each in rows if isinstance(each, dict)] if isinstance(rows, list) else []
 
 
 def flattened(run: dict[str, Any]) -> dict[str, Value]:
@@ -167,22 +126,18 @@ def flattened(run: dict[str, Any]) -> dict[str, Value]:
     `request.options`. Orientation and sides of the image come from its affine. `UNLISTED_NUMBERS` and lists of more
     than four numbers are left out.
     """
-    columns: dict[str, Value] = {}
-    _put_grid(columns, run.get("box"))
+    columns = _grid(run["box"]) if run.get("box") else {}
     for name, value in run.items():
         _put(columns, plain(name), value)
-    request = run.get("request")
-    if isinstance(request, dict):
-        columns["request.sha256"] = _scalar(request.get("sha256"))
-        stated = request.get("options")
-        known = {name.lower() for name in columns}  # "k-d" on the command line is k_D
-        for name, value in stated.items() if isinstance(stated, dict) else ():
-            if f"options.{name.replace('-', '_')}".lower() not in known:
-                _put(columns, f"request.options.{name}", value)
+    request = run.get("request") or {}
+    columns["request.sha256"] = request.get("sha256")
+    known = {name.lower() for name in columns}  # "k-d" on the command line is k_D
+    for name, value in request.get("options", {}).items():
+        if f"options.{name.replace('-', '_')}".lower() not in known:
+            _put(columns, f"request.options.{name}", value)
     for name in ("labels", "interfaces"):
-        for each in _table(run, name):
-            if isinstance(number := each.get("label"), int):
-                _put(columns, f"{name}.{number}", {key: value for key, value in each.items() if key != "label"})
+        for each in run.get(name) or ():
+            _put(columns, f"{name}.{each['label']}", {key: value for key, value in each.items() if key != "label"})
     return columns
 
 
@@ -200,33 +155,20 @@ def _put(columns: dict[str, Value], name: str, value: Any) -> None:
             for number, item in enumerate(value, start=1):
                 _put(columns, f"{name}.{number}", item)
     else:
-        columns[intern(name)] = _scalar(value)
+        columns[intern(name)] = plain(value) if isinstance(value, str) else value
 
 
-def _scalar(value: Any) -> Value:
-    """Return a text on one line, or a finite number; None for anything else."""
-    if isinstance(value, str):
-        return plain(value)
-    if isinstance(value, float):
-        return value if isfinite(value) else None
-    return value if isinstance(value, int) and abs(value) < LARGEST_COUNT else None
-
-
-def _put_grid(columns: dict[str, Value], box: Any) -> None:
-    """Add the image's orientation, obliquity, spacing and shape."""
-    try:
-        affine = np.array(box["affine"], dtype=np.float64)
-        shape = [int(each) for each in box["shape"]]
-        steps = np.linalg.norm(affine[:-1, :-1], axis=0)
-    except (KeyError, TypeError, ValueError, IndexError):
-        return
-    if affine.shape != (len(shape) + 1, len(shape) + 1) or not np.isfinite(affine).all() or not steps.all():
-        return
-    columns["grid.orientation"] = orientation_code(affine)
-    columns["grid.oblique_degrees"] = oblique_degrees(affine)
-    columns["grid.spacing_mm"] = " x ".join(f"{step:.4g}" for step in steps)
-    columns["grid.volume_mm"] = abs(float(np.linalg.det(affine[:-1, :-1]))) * float(np.prod(shape))
-    columns["grid.shape"] = " x ".join(str(side) for side in shape)
+def _grid(box: dict[str, Any]) -> dict[str, Value]:
+    """Return the image's orientation, obliquity, spacing and shape."""
+    affine, shape = np.array(box["affine"]), box["shape"]
+    steps = np.linalg.norm(affine[:-1, :-1], axis=0)
+    return {
+        "grid.orientation": orientation_code(affine),
+        "grid.oblique_degrees": oblique_degrees(affine),
+        "grid.spacing_mm": " x ".join(f"{step:.4g}" for step in steps),
+        "grid.volume_mm": abs(float(np.linalg.det(affine[:-1, :-1]))) * float(np.prod(shape)),
+        "grid.shape": " x ".join(map(str, shape)),
+    }
 
 
 def orientation_code(affine: np.ndarray) -> str:

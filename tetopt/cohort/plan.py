@@ -163,7 +163,7 @@ def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[P
         request = None
         if numbers_path(out, entry.key).is_file():
             request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
-        return entry._replace(state=state_of(out, entry.key, suffix, request))
+        return entry._replace(state=state_of(out, entry.key, request))
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(state, entries))

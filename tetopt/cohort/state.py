@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from tetopt.cohort.layout import failure_path, mesh_name, numbers_path, subject_folder, table_in
+from tetopt.cohort.layout import failure_path, numbers_path, table_in
 from tetopt.cohort.subjects import IMAGE_PATTERN
+from tetopt.io.text import plain
 
 Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": the mesh violates a requirement
 WORDS_LISTED = 4  # changes that fit on a line
@@ -16,35 +17,44 @@ class SubjectState(NamedTuple):
     """The state of a subject."""
 
     status: Status
-    why: str  # changes, or the failure; else empty
+    why: str  # on one line; empty for a subject that is done
 
 
-def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -> SubjectState:
+def state_of(out: Path, key: str, request: dict[str, Any] | None = None) -> SubjectState:
     """Return the state of a subject.
 
     Parameters
     ----------
     out : Path
     key : str
-    suffix : str
-        Suffix of its mesh's file.
     request : dict, optional
-        The current request, from `tetopt.job.request.requested`; without it, existing outputs are not compared.
+        The current request, from `tetopt.job.request.requested`. Outputs of the same request count, whatever failed
+        since; without it, outputs are not compared.
     """
-    numbers = table_in(numbers_path(out, key))
-    failure = table_in(failure_path(out, key))
+    path, failure = numbers_path(out, key), failure_path(out, key)
+    numbers = table_in(path)
     before = _request_of(numbers or {})
-    mesh = subject_folder(out, key) / mesh_name(key, str(before["options"].get("format", suffix)))
-    is_there = numbers is not None and mesh.is_file() and mesh.stat().st_size > 0
-    if is_there and numbers is not None and (request is None or before.get("sha256") == request["sha256"]):
-        return SubjectState(
-            "violated" if numbers.get("violated") else "done", "; ".join((numbers.get("violated") or {}).values())
-        )
-    if failure is not None:
-        return SubjectState("failed", str(failure.get("reason", "")))
-    if is_there and request is not None:
+    is_same = request is not None and before.get("sha256") == request["sha256"]
+    is_whole = numbers is not None and mesh_of(out, key) is not None
+    if failure.exists() and not (is_whole and is_same):
+        reason = (table_in(failure) or {}).get("reason", f"{failure.name} cannot be read")
+        return SubjectState("failed", plain(str(reason)))
+    if not path.exists():
+        return SubjectState("missing", "not run yet")
+    if numbers is None or not is_whole:
+        wrong = "its numbers cannot be read" if numbers is None else "its numbers exist, but its mesh is missing"
+        return SubjectState("failed", f"{wrong}; run it again")
+    if request is not None and not is_same:
         return SubjectState("changed", differences(before, request))
-    return SubjectState("missing", "")
+    violated = numbers.get("violated") or {}
+    return SubjectState("violated" if violated else "done", plain("; ".join(violated.values())))
+
+
+def mesh_of(out: Path, key: str) -> Path | None:
+    """Return the path of a subject's mesh, in any format; None without one."""
+    path = numbers_path(out, key)
+    files = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json" and each.stat().st_size > 0)
+    return min(files, default=None)
 
 
 def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:
