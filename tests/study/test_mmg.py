@@ -9,6 +9,7 @@ import tetopt
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box
 from tetopt.geometry.simplex import volumes
+from tetopt.study import mmg
 from tetopt.study.endings import NotInstalled
 from tetopt.study.mmg import classes_of, remeshed
 from tetopt.study.pipelines import PIPELINES, PipelineInput
@@ -20,7 +21,7 @@ IMAGE, LABELS = PHANTOM.image(voxel_mm=4), PHANTOM.label_image(voxel_mm=4)
 
 @needs_mmgpy
 @pytest.mark.parametrize("labels", [LABELS, None])
-def test_a_box_of_labelled_cells(labels):
+def test_a_box_of_labelled_cells(labels, monkeypatch):
     """An oblique box is filled to the last digits; labels of the user's stay those, in their places."""
     turned = np.array([[0.0, -4.0, 0.0, 3.0], [3.2, 0.0, -2.4, 5.0], [2.4, 0.0, 3.2, -7.0], [0.0, 0.0, 0.0, 1.0]])
     image = tetopt.Image(IMAGE.data, turned)
@@ -39,8 +40,9 @@ def test_a_box_of_labelled_cells(labels):
     rows = tetopt.label_fidelity(given, mesh, made.labels)
     assert [row.label for row in rows] == [0, 7, 14]
     assert min(row.dice for row in rows) > 0.8
-    again = PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3))
-    assert again.mesh.points.tobytes() == mesh.points.tobytes()
+    monkeypatch.setattr(mmg, "MMG_RUNS", 1)
+    first, again = (PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3)).mesh for _ in range(2))
+    assert first.points.tobytes() == again.points.tobytes()
 
 
 def test_classes_without_labels():

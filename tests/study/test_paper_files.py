@@ -17,14 +17,22 @@ from tetopt.study.paper_files import PAPER_PICTURES
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, opengl):
-    """The whole command, few seeds, on the head phantom in the place of a brain volume."""
+    """The whole command, small: few seeds, places and nodes, on the head phantom in the place of a brain volume."""
     folder = tmp_path_factory.mktemp("paper")
     phantom = tetopt.load_phantom("ellipsoids_brain")
     tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=4.0))
     tetopt.save_image(folder / "tissue.nii.gz", phantom.label_image(voxel_mm=4.0))
     out = folder / "out"
     inputs = ["--image", str(folder / "head.nii.gz"), "--labels", str(folder / "tissue.nii.gz")]
-    assert main(["paper", "-o", str(out), *inputs, "--seeds", "3"]) == 0
+    lattice, landscape = paper.lattice_mesh, paper.figure_2b
+
+    def fewer(image, *kind, nodes=None, **options):
+        return lattice(image, *kind, nodes=nodes and 1500, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "figure_2b", lambda k_D: landscape(k_D, n_places=9))
+        patch.setattr(paper, "lattice_mesh", fewer)
+        assert main(["paper", "-o", str(out), *inputs, "--seeds", "2"]) == 0
     return out
 
 
@@ -80,7 +88,7 @@ def test_every_other_number_is_on_the_page(run):
         assert row["ours"] == pytest.approx(paper.errors_of(paper.figure_2(k_D).result.mesh))
     assert figure_2["dice"]["initial mesh"]["3"] < figure_2["dice"]["k_D = 0.3"]["3"] - 0.2
     (figure_1,) = [s for title, s in sections.items() if title.startswith("Fig. 1")]
-    spread = paper.figure_1_spread(3)
+    spread = paper.figure_1_spread(2)
     for row in figure_1["errors"]:
         np.testing.assert_allclose([row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0))
 

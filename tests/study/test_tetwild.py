@@ -129,7 +129,7 @@ def test_shaken_boundary_is_put_back():
 
 @pytest.mark.full
 def test_hole_is_refused():
-    mesh = tetopt.lattice_mesh(IMAGE, nodes=60)
+    mesh = tetopt.lattice_mesh(IMAGE, nodes=20)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     middle = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1).argmin()
     with pytest.raises(tetopt.InputError, match=r"are inverted|fill 0"):
