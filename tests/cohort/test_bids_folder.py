@@ -55,7 +55,7 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
         ("02", "", "sub-02/anat/sub-02_T1w.nii.gz"),
     ]
     assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
-    assert subjects[2].files == subjects[2].options == {}
+    assert subjects[2].options == {}
     assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
     with pytest.warns(UserWarning, match=r"left out subjects without _T1w in ses-b: 1 \(sub-02\)"):
         chosen = bids_subjects(folder, sessions=["ses-b"])
@@ -121,7 +121,7 @@ def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatc
     assert len(written) == len(PATTERNS)
     for pattern in written:
         ((session, name),) = [each for part, each in PATTERNS.items() if part in pattern]
-        subject = Subject("1", session, (), {}, {}, "")
+        subject = Subject("1", session, (), {}, "")
         assert matching(pattern, subject) == tmp_path / "derivatives" / name
         assert matching(pattern, subject).is_file()
 

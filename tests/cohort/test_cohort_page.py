@@ -1,4 +1,4 @@
-"""The page of a cohort: what is in it, also without scripts; how it sorts and filters, in a browser."""
+"""The page of a cohort: what is in it; how it sorts and filters, in a browser."""
 
 import html
 import json
@@ -190,12 +190,3 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
     assert re.fullmatch(r"1.\d+ l or more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
     assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
     assert right == "≥ " + highest[: highest.index(" or more")]
-
-
-def test_without_scripts_there_is_a_table(cohort):
-    """What the browser shows then is in the file as it is."""
-    _, text = cohort
-    table = text[text.index('<div id="subjects">') : text.index('<script type="application/json"')]
-    assert table.count("<tr>") == 101
-    assert "orientation LPS: 94 of 95 have RAS" in table
-    assert table.index("LPS") < table.index(key_of(0))

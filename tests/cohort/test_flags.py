@@ -14,7 +14,7 @@ OBLIQUE[:3, :3] = [[0.9, -0.436, 0.0], [0.436, 0.9, 0.0], [0.0, 0.0, 1.2]]
 
 
 def row_of(k, run, **changes):
-    row = Row(f"sub-{k}", f"sub-{k}", "", "done", "", (), {}, {}, {}, {}, {})
+    row = Row(f"sub-{k}", "done", "", (), {}, {}, {}, {}, {})
     return with_numbers(row, run | {"label_names": {"17": "hippocampus"}})._replace(**changes)
 
 
@@ -128,7 +128,7 @@ def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
 
 
 def flags_of_column(column, values):
-    row = Row("sub-1", "sub-1", "", "done", "", (), {}, {}, {}, {}, {})
+    row = Row("sub-1", "done", "", (), {}, {}, {}, {}, {})
     return flags_of([row._replace(numbers={"quality.ndim": 3, column: float(value)}) for value in values])
 
 

@@ -14,7 +14,7 @@ def table(path, *lines):
 
 
 def subject(name, session="", **others):
-    values = {"images": (Path("/a.nii"),), "files": {}, "options": {}, "place": f"row {name}"}
+    values = {"images": (Path("/a.nii"),), "options": {}, "place": f"row {name}"}
     return Subject(name, session, **(values | others))
 
 
@@ -24,11 +24,9 @@ def test_a_table_says_what_is_meshed(tmp_path):
         "sub-01\tses-a\ta.nii\tb.nii\tn/a\t500\t\told", "02\t\t/c.nii\tn/a\tm.nii\tn/a\t0.3\t",
     )  # fmt: skip
     first, second = read_table(path)
-    assert first == Subject(
-        "01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {}, {"nodes": "500"}, f"{path}, line 2"
-    )
+    assert first == Subject("01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {"nodes": "500"}, f"{path}, line 2")
     assert second == Subject(
-        "02", "", (Path("/c.nii"),), {"mask": tmp_path / "m.nii"}, {"k_d": "0.3"}, f"{path}, line 3"
+        "02", "", (Path("/c.nii"),), {"mask": str(tmp_path / "m.nii"), "k_d": "0.3"}, f"{path}, line 3"
     )
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
 
@@ -90,7 +88,7 @@ def test_names_that_no_file_can_have_are_refused():
 def test_a_table_that_was_written_reads_the_same(tmp_path):
     rows = [
         subject("01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}),
-        subject("02", "b", images=(tmp_path / "z\tz.nii",), files={"labels": tmp_path / "l.nii"}),
+        subject("02", "b", images=(tmp_path / "z\tz.nii",), options={"labels": str(tmp_path / "l.nii")}),
     ]
     for name in ("t.tsv", "t.csv"):
         write_table(tmp_path / name, rows)

@@ -73,7 +73,7 @@ def bids_subjects(
         what = f"_{suffix} in {', '.join(f'ses-{visit}' for visit in visits)}" if visits else f"_{suffix}"
         _warn_of_others(folder, what, {subject for subject, _ in paths})
     return [
-        Subject(subject, session, (path,), {}, {}, plain(str(path.relative_to(folder))))
+        Subject(subject, session, (path,), {}, plain(str(path.relative_to(folder))))
         for (subject, session), (path,) in paths.items()
     ]
 

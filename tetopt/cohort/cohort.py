@@ -10,25 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.cohort.estimate import Estimate, estimated, share_for
-from tetopt.cohort.layout import (
-    WORK_NAME,
-    begin,
-    check_out,
-    clean,
-    failure_path,
-    linked_place,
-)
+from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_path, linked_place
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS, save_cohort_files
-from tetopt.cohort.plan import (
-    PlannedSubject,
-    checked_suffix,
-    chosen,
-    entries_of,
-    subjects_of,
-    with_states,
-)
+from tetopt.cohort.plan import PlannedSubject, checked_suffix, chosen, entries_of, subjects_of, with_states
 from tetopt.cohort.run import Ended, SubjectTask, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.errors import InputError

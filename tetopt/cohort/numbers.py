@@ -13,15 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.cohort.layout import (
-    KEY_PATTERN,
-    LOGS_NAME,
-    failure_path,
-    log_path,
-    numbers_path,
-    table_in,
-    thumbnail_path,
-)
+from tetopt.cohort.layout import KEY_PATTERN, LOGS_NAME, failure_path, log_path, numbers_path, table_in, thumbnail_path
 from tetopt.cohort.state import Status, mesh_of, state_of
 from tetopt.geometry.box import world_axes
 from tetopt.io.text import plain
@@ -37,6 +29,7 @@ UNLISTED_NUMBERS = (
     "interfaces", "labels", "contacts", "thickness", "request",
 )  # fmt: skip
 SHORT_LIST = 4  # numbers of a list with a column each, as spacings and sides; longer lists are hundreds of moduli
+OF_LABEL = re.compile(r"(labels|interfaces)\.(\d+)\..*")  # columns of a label
 NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
 # First letters of texts that spreadsheets read as formulas (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
@@ -48,8 +41,6 @@ class Row(NamedTuple):
     """One subject, from the outputs of its run."""
 
     key: str  # "sub-01_ses-a"
-    subject: str  # "sub-01"
-    session: str  # "ses-a", or ""
     status: Status  # never "changed"
     reason: str  # failure or violated requirements, on one line; "" for a subject that is done
     violated: tuple[str, ...]  # the names of these requirements
@@ -92,10 +83,9 @@ def natural_order(text: str) -> list[tuple[int, str]]:
 
 def row_of(out: Path, key: str) -> Row:
     """Return the row of one subject, by its key; see `collect`."""
-    subject, _, session = key.partition("_")
     status, reason = state_of(out, key)
     places = {"log": log_path(out, key)}
-    row = Row(key, subject, session, status, reason, (), {}, {}, {}, {}, {})
+    row = Row(key, status, reason, (), {}, {}, {}, {}, {})
     if status in ("done", "violated"):
         numbers = numbers_path(out, key)
         places |= {"mesh": mesh_of(out, key) or numbers, "numbers": numbers, "thumbnail": thumbnail_path(out, key)}
@@ -198,16 +188,10 @@ def oblique_degrees(affine: np.ndarray) -> float:
 
 def column_names(rows: Sequence[Row]) -> list[str]:
     """Return the columns of all rows, in the order of run.json, with those of labels last and by number."""
-    names = list(dict.fromkeys(name for row in rows for name in row.numbers))
-    is_of_label = [re.fullmatch(r"(labels|interfaces)\.\d+\..*", name) is not None for name in names]
-    of_labels = [name for name, is_one in zip(names, is_of_label, strict=True) if is_one]
-    places = {name: place for place, name in enumerate(of_labels)}
-
-    def order(name: str) -> tuple[bool, int, int]:
-        kind, number, _ = name.split(".", 2)
-        return kind == "interfaces", int(number), places[name]
-
-    return [name for name, is_one in zip(names, is_of_label, strict=True) if not is_one] + sorted(of_labels, key=order)
+    names = dict.fromkeys(name for row in rows for name in row.numbers)
+    matches = {name: match for name in names if (match := OF_LABEL.fullmatch(name)) is not None}
+    of_labels = sorted(matches, key=lambda name: (matches[name][1] == "interfaces", int(matches[name][2])))
+    return [*(name for name in names if name not in matches), *of_labels]
 
 
 def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) -> None:
@@ -226,7 +210,8 @@ def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) 
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write("\t".join(map(field_text, [*heads, *names])) + "\n")
         for row, reasons in zip(rows, flags, strict=True):
-            fixed = [row.subject, row.session or None, row.status, row.reason or None, "; ".join(reasons) or None]
+            subject, _, session = row.key.partition("_")
+            fixed = [subject, session, row.status, row.reason, "; ".join(reasons)]
             stream.write("\t".join(map(field_text, chain(fixed, map(row.numbers.get, names)))) + "\n")
     labels = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
     dimensions = {row.numbers.get("quality.ndim") for row in rows} - {None}
@@ -278,9 +263,9 @@ def description(column: str, label_names: dict[int, str] | None = None) -> dict[
     else:
         beginning = COLUMN_GROUPS.get(first)
         words, unit = known.get(general) or [f"{column} of run.json" if beginning is None else beginning + rest, ""]
-    if (match := re.fullmatch(r"(?:labels|interfaces)\.(\d+)\..*", column)) is not None:
-        name = (label_names or {}).get(int(match[1]), "")
-        words = f"Label {match[1]}{f' ({name})' if name else ''}: {words}"
+    if (match := OF_LABEL.fullmatch(column)) is not None:
+        name = (label_names or {}).get(int(match[2]), "")
+        words = f"Label {match[2]}{f' ({name})' if name else ''}: {words}"
     return {"Description": words} | ({"Units": unit} if unit else {})
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,6 @@ from tetopt.report.page import data_html, package_text, rendered, script_html, w
 PAGE_NUMBERS = 1_500_000  # in the page at most, about 10 MB: a browser on a phone reads them in seconds
 PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64; with more subjects, the flagged ones and a sample
 LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
-LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # per subject; the TSV table has all
 SHOWN_DIGITS = 4  # of numbers in the page
 LISTED_VALUES = 6  # of an option that differs; with more, only their number is shown
@@ -88,11 +87,10 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
         )
     if left_out:
         note += f" Numbers of {left_out} more labels are only in cohort.tsv."
-    reasons, subjects = _failures(rows), list(_first_subjects(rows, flags))
+    reasons = _failures(rows)
     content = rendered(
         "cohort/cohort.html", summary=_summary(rows, flags), reasons=reasons, most=LISTED_FAILURES, quote=quote,
-        n_failed=sum(len(failed) for _, failed in reasons), note=note, first_subjects=subjects,
-        first_words=f"The first {LISTED_SUBJECTS} of {len(rows)}." if len(rows) > LISTED_SUBJECTS else "",
+        n_failed=sum(len(failed) for _, failed in reasons), note=note,
         data=data_html("data", _data(rows, flags, pictures, names)), script=script_html("cohort"),
     )  # fmt: skip
     write_page(path, f"Cohort {out.resolve().name}", content, package_text("cohort/cohort.css"))
@@ -219,11 +217,3 @@ def _row_data(row: Row, flags: Sequence[Flag], columns: Iterable[str]) -> list[A
 def _shown(value: Value) -> Value:
     """Round a float for the page."""
     return float(f"{value:.{SHOWN_DIGITS}g}") if isinstance(value, float) else value
-
-
-def _first_subjects(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> Iterator[list[str]]:
-    """Yield rows of the first subjects, the flagged ones before the others, for browsers without scripts."""
-    for place in sorted(range(len(rows)), key=lambda place: -len(flags[place]))[:LISTED_SUBJECTS]:
-        row = rows[place]
-        odd = "; ".join(flag.words for flag in flags[place][:LISTED_FLAGS])
-        yield [row.key, STATUS_WORDS[row.status], row.reason if row.status == "failed" else odd]

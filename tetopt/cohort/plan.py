@@ -21,8 +21,8 @@ from tetopt.cohort.subjects import (
     key,
     label_of,
     matching,
-    of_each,
     read_table,
+    with_files,
 )
 from tetopt.errors import InputError
 from tetopt.io.formats import BUILT_IN
@@ -32,7 +32,7 @@ from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.job.texts import option_words, with_options
-from tetopt.model.mappings import FILES_IN_TEXTS, named_file
+from tetopt.model.mappings import FILES_IN_TEXTS
 
 
 class PlannedSubject(NamedTuple):
@@ -50,8 +50,8 @@ class PlannedSubject(NamedTuple):
 
     def row(self) -> Subject:
         """Return the subject with the files that patterns match."""
-        files = {name: path for name in FILE_OPTIONS if (path := getattr(self.plan.bare, name)) is not None}
-        return self.subject._replace(files=files)
+        files = {name: str(path) for name in FILE_OPTIONS if (path := getattr(self.plan.bare, name)) is not None}
+        return self.subject._replace(options=self.subject.options | files)
 
     def words(self) -> tuple[str, ...]:
         """Return the arguments of `tetopt mesh`, without outputs and threads."""
@@ -98,9 +98,8 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
         All problems of all subjects.
     """
     problems = [("", line) for line in doubled(subjects)]
-    mappings = {name: named_file(getattr(options, name) or "") for name in FILES_IN_TEXTS}
-    # A worker may have another current folder.
-    placed: dict[str, Any] = {name: str(file.absolute()) for name, file in mappings.items() if file is not None}
+    texts = {name: text for name in FILES_IN_TEXTS if (text := getattr(options, name)) is not None}
+    placed: dict[str, Any] = dict(with_files(texts, os.path.abspath))  # a worker may have another current folder
     options, entries = replace(options, **placed), []
     for subject in subjects:
         try:
@@ -129,13 +128,12 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
     """Plan a subject with its files and options; raise InputError for invalid options."""
-    patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
-    files = {name: of_each(name, each, partial(matching, subject=subject)) for name, each in patterns.items()}
+    patterns = {name: str(path) for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
+    texts = with_files(patterns, partial(matching, subject=subject)) | subject.options
     if "threads" in subject.options:
         raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
-    own = with_options(options, {name.replace("_", "-"): text for name, text in subject.options.items()})
-    named: dict[str, Any] = files | subject.files
-    return resolved(JobOptions(**vars(own) | named, images=list(subject.images), output=output))
+    own = with_options(options, {name.replace("_", "-"): text for name, text in texts.items()})
+    return resolved(JobOptions(**vars(own), images=list(subject.images), output=output))
 
 
 def _missing(job: JobOptions) -> Iterator[str]:

@@ -33,7 +33,6 @@ class Subject(NamedTuple):
     subject: str  # without "sub-"
     session: str  # without "ses-"; empty for none
     images: tuple[Path, ...]
-    files: dict[str, Path]  # by `FILE_OPTIONS`
     options: dict[str, str]  # by the names of `tetopt mesh`, with underscores, as text
     place: str  # its place in the table, for messages
 
@@ -88,13 +87,11 @@ def read_table(path: Path) -> list[Subject]:
             problems.append(f"{place}: missing {' and '.join(missing)}")
             continue
         options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
-        named = [name for name in FILE_OPTIONS if name in options]
-        files = {name: of_each(name, options.pop(name), partial(_absolute, folder)) for name in named}
-        options |= {name: str(_absolute(folder, str(file))) for name, file in _mapping_files(options)}
         subjects.append(
             Subject(
                 cells["subject"].removeprefix("sub-"), cells.get("session", "").removeprefix("ses-"),
-                tuple(_absolute(folder, cells[name]) for name in images), files, options, place,
+                tuple(_absolute(folder, cells[name]) for name in images),
+                with_files(options, partial(_absolute, folder)), place,
             )
         )  # fmt: skip
     if problems:
@@ -130,28 +127,33 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
     folder = path.parent.resolve()
     n_images = max((len(each.images) for each in subjects), default=1)
     images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
-    named = [name for name in FILE_OPTIONS if any(name in each.files for each in subjects)]
-    options = sorted({name for each in subjects for name in each.options})
+    options = sorted(
+        {name for each in subjects for name in each.options}, key=lambda name: (name not in FILE_OPTIONS, name)
+    )
     session = ["session"] if any(each.session for each in subjects) else []
-    columns = ["subject", *session, *images, *named, *options]
+    columns = ["subject", *session, *images, *options]
     stream = StringIO()
     writer = csv.DictWriter(
         stream, columns, restval="n/a", lineterminator="\n", delimiter="\t" if path.suffix.lower() == ".tsv" else ","
     )
     writer.writeheader()
     for each in subjects:
-        row = {"subject": each.subject, **({"session": each.session} if each.session else {}), **each.options}
-        row |= {name: _relative(folder, file) for name, file in _mapping_files(each.options)}
-        row |= {name: _relative(folder, image) for name, image in zip(images, each.images, strict=False)}
-        files = {name: str(of_each(name, file, partial(_relative, folder))) for name, file in each.files.items()}
-        writer.writerow(row | files)
+        row = {"subject": each.subject, **({"session": each.session} if each.session else {})}
+        row |= {name: os.path.relpath(image, folder) for name, image in zip(images, each.images, strict=False)}
+        writer.writerow(row | with_files(each.options, partial(os.path.relpath, start=folder)))
     return stream.getvalue()
 
 
-def of_each(option: str, path: Path | str, function: Callable[[str], Path | str]) -> Path:
-    """Apply a function to an option's file; for tissues, to each of the comma-separated files."""
-    parts = str(path).split(",") if option == "tissues" else [str(path)]
-    return Path(",".join(str(function(part.strip())) for part in parts))
+def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -> dict[str, str]:
+    """Return options with the results of a function in place of the files that they name."""
+    changed = {}
+    for name, text in options.items():
+        if name in FILE_OPTIONS:
+            files = text.split(",") if name == "tissues" else [text]
+            changed[name] = ",".join(str(function(file.strip())) for file in files)
+        elif name in FILES_IN_TEXTS and named_file(text) is not None:
+            changed[name] = str(function(text))
+    return options | changed
 
 
 def write_table(path: Path, subjects: Sequence[Subject]) -> None:
@@ -220,13 +222,6 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
     return columns
 
 
-def _mapping_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
-    """Yield the files that texts of a subject's options name."""
-    for name in FILES_IN_TEXTS:
-        if (file := named_file(options.get(name, ""))) is not None:
-            yield name, file
-
-
 def _image_number(name: str) -> int:
     match = IMAGE_PATTERN.match(name)
     return int(match[1] or 1) if match else 0
@@ -234,7 +229,3 @@ def _image_number(name: str) -> int:
 
 def _absolute(folder: Path, cell: str) -> Path:
     return Path(os.path.normpath(folder / Path(cell).expanduser()))
-
-
-def _relative(folder: Path, path: Path | str) -> str:
-    return os.path.relpath(path, folder)
