@@ -267,8 +267,8 @@ def test_an_output_that_came_meanwhile_stays(image, folder, monkeypatch, capsys)
     monkeypatch.setattr(tetopt.job.write, "save_for_solver", raced)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
     assert (folder / "a.vtu").read_text() == "theirs"
-    assert f"is in {folder / 'a_kept_1.vtu'}" in capsys.readouterr().err
-    assert len(tetopt.load_mesh(folder / "a_kept_1.vtu").mesh.cells) > 100
+    assert f"is in {folder / 'a_optimised_1.vtu'}" in capsys.readouterr().err
+    assert len(tetopt.load_mesh(folder / "a_optimised_1.vtu").mesh.cells) > 100
 
 
 def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, capsys):

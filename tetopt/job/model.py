@@ -51,7 +51,7 @@ from tetopt.model.sets import (
     parse_set,
     standard_names,
 )
-from tetopt.system.files import TakenError, kept_places
+from tetopt.system.files import kept_places
 
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
@@ -332,8 +332,6 @@ def keep_early(mesh: Mesh, labels: NDArray[np.int64] | None, places: Iterable[Pa
     for place in places:
         try:
             save_mesh(place, mesh, data, order=1 if mesh.midpoints is None else 2)
-        except TakenError:  # its message says where the mesh is
-            raise
         except (OSError, MemoryError, InputError) as error:  # as of a format that needs materials
             reason = error_words(error)
         else:

@@ -38,7 +38,7 @@ from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes
-from tetopt.system.files import TakenError, kept_places
+from tetopt.system.files import kept_places
 
 
 def model_with(
@@ -84,8 +84,6 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
         whole = model_with(task, result.mesh, job, about, labels=result.labels, fields=fields)
         model = with_chosen_sets(whole, job.output, job)
         save_for_solver(job.output, model, job)
-    except TakenError:  # its message says where the mesh is
-        raise
     except Exception as error:  # the mesh may have taken hours
 
         def bare() -> Model:

@@ -28,10 +28,6 @@ TEMPORARY_LETTERS = 40  # letters of an output's name in its temporary name: the
 UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EBADF)
 
 
-class TakenError(InputError):
-    """Another program took the output's name during the run; the output is kept next to it."""
-
-
 class Outputs(NamedTuple):
     """The outputs of one command."""
 
@@ -191,7 +187,7 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
 
     Raises
     ------
-    TakenError
+    InputError
         A file has appeared there since `checked_output`.
     OSError
         Any other failure, with the path and, on a full disk, the number of bytes (`n_bytes`) if known.
@@ -205,18 +201,18 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         try:
             yield temporary
             _on_disk(temporary, place)
-            if may_replace:
-                os.replace(temporary, place)
-            elif not _linked(temporary, place):
-                kept = _beside(temporary, path)
-                raise TakenError(
-                    f"{path}: another program has written this file in the meantime; it is kept, as `force` is not "
-                    f"set, and the output is in {kept}"
-                )
+            _check_free(path, place, may_replace)
+            os.replace(temporary, place)
             _synchronise_folder(place.parent)
         finally:
             with suppress(OSError):  # then a hidden file remains, and the first error is reported
                 os.unlink(temporary)
+
+
+def _check_free(path: Path, place: Path, may_replace: bool) -> None:
+    """Raise InputError if something has appeared in an output's place that it may not replace."""
+    if not may_replace and os.path.lexists(place):
+        raise InputError(f"{path}: another program has written this in the meantime; pass `force` to replace it")
 
 
 @contextmanager
@@ -256,7 +252,7 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    TakenError
+    InputError
         Something has appeared there since `checked_output`.
     OSError
         As `written_whole`.
@@ -268,8 +264,7 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
             for name in names:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
-        if not may_replace and os.path.lexists(place):
-            raise TakenError(f"{path}: another program has written it in the meantime; pass `force` to replace it")
+        _check_free(path, place, may_replace)
         old = None
         if place.is_dir():
             old = _temporary_folder(stack, path, place.parent) / "old"
@@ -380,32 +375,6 @@ def _synchronise_folder(folder: Path) -> None:
     except OSError as error:
         if error.errno not in UNSYNCHRONISED:
             raise
-
-
-def _linked(temporary: Path, place: Path) -> bool:
-    """Give the file its name if that is free; return whether it was."""
-    try:
-        os.link(temporary, place)
-    except FileExistsError:  # a network file system reports this, too, if an answer was lost
-        return os.path.samefile(temporary, place)
-    except OSError:  # FAT and some network file systems have no links: reserve the name first, then replace it
-        try:
-            os.close(os.open(place, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
-        except FileExistsError:
-            return False
-        try:
-            os.replace(temporary, place)
-        except OSError:
-            os.unlink(place)
-            raise
-    return True
-
-
-def _beside(temporary: Path, path: Path) -> Path:
-    """Give the file a free name next to its own; return the name."""
-    end = next((path.name[-len(each) :] for each in (".nii.gz",) if path.name.lower().endswith(each)), path.suffix)
-    stem = path.name[: len(path.name) - len(end)]
-    return next(kept for number in count(1) if _linked(temporary, kept := path.with_name(f"{stem}_kept_{number}{end}")))
 
 
 def _reason(error: OSError, folder: Path, n_bytes: int | None) -> str:
