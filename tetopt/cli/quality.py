@@ -11,7 +11,7 @@ from rich.table import Table
 from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.job.judge import Judgement, judge
-from tetopt.job.options import ImagePart, LabelNamesOption, MaskPart, Option
+from tetopt.job.options import LabelNamesOption, MaskedPart, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
@@ -32,14 +32,13 @@ def quality_command(
     label_names: LabelNamesOption = None,
     every: Annotated[bool, Option(None, "Print all measures, and all labels.", "all")] = False,
     *,
-    part: ImagePart,
-    region: MaskPart,
+    part: MaskedPart,
     numbers: NumberOptions,
 ) -> int:
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     numbers.check()
     mesh, image = mesh_and_image(paths, image)
-    came = judge(mesh, image, labels, part=part, region=region, label_names=label_names, check=check)
+    came = judge(mesh, image, labels, part=part, label_names=label_names, check=check)
     numbers.save(came.numbers)
     size, source = came.numbers["size"], came.source
     table = new_table("", escape(mesh.name))

@@ -14,7 +14,7 @@ from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.energy.sampling import overlap_of
 from tetopt.job.inputs import content_within, read_labels, read_mesh, warn_of_other_image
-from tetopt.job.options import ImagePart, MaskPart, Option
+from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.files import checked_output
 
@@ -28,8 +28,7 @@ def segment_command(
     ] = None,
     image_path: Annotated[Path | None, Option("IMAGE", "The image to segment.", "image")] = None,
     *,
-    part: ImagePart,
-    region: MaskPart,
+    part: MaskedPart,
     numbers: NumberOptions,
 ) -> int:
     """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and label their voxels."""
@@ -41,10 +40,10 @@ def segment_command(
     if image_path is None:
         raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
     loaded = read_mesh(mesh_path)
-    what = content_within(image_path, part, region, loaded)
+    what = content_within(image_path, part, loaded)
     image, mesh = what.given, loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
-    warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=region.registered)
+    warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=part.registered)
     inside = _voxels_in(mesh, what, mesh_path, image_path)
     labels = segment(what, mesh, classes)
     of_class, h = labels.data[inside].astype(np.int64), image.data[inside]

@@ -16,7 +16,7 @@ from tetopt import InputError
 from tetopt.cli.console import print_line
 from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
 from tetopt.job.inputs import check_part, content_within, label_table, number_of, read_mesh, warn_of_other_image
-from tetopt.job.options import BoxPart, ImagePart, MaskPart, Option
+from tetopt.job.options import BoxPart, MaskedPart, MaskPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
@@ -42,14 +42,15 @@ def view_command(
     html = None if how.html is None else checked_output(how.html, (".html",), force)
     limits = None if how.limits is None else _limits(how.limits)
     mesh_path, image_path = mesh_and_image(paths, image_path)
-    check_part(image_path, part, region)
+    counted = MaskedPart(**vars(part), **vars(region))
+    check_part(image_path, counted)
     loaded = read_mesh(mesh_path)
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None
     if image_path is not None:
-        what = content_within(image_path, ImagePart(**vars(part)), region, loaded)
+        what = content_within(image_path, counted, loaded)
         image = what.given
-        warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=region.registered)
+        warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=counted.registered)
         if "mean" not in fields:
             fields = cell_fields(mesh, what) | fields
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names

@@ -68,7 +68,7 @@ def convert_file(
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
         raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
-    check_part(image, part, part, part.labels)
+    check_part(image, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
     loaded = with_labels(loaded, part.labels, part)
@@ -81,7 +81,7 @@ def convert_file(
         solver = replace(solver, loads=loads_of(loaded))
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
     if image is not None:
-        what = content_within(image, part, part, loaded)
+        what = content_within(image, part, loaded)
         if warn_of_other_image(loaded, mesh, image, what.given, is_registered=part.registered):
             about = texts_of(loaded, is_other=True)
         voxels, box = what.image, box_of(what.given) if box is None else box

@@ -37,7 +37,7 @@ from tetopt.io.meshes import load_mesh
 from tetopt.io.read_dicom import frame_of_reference
 from tetopt.io.stacks import parse_spacing
 from tetopt.job.events import note, warning
-from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskPart, SourceOptions, stated_part
+from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskedPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask
 from tetopt.model.labels import NO_TABLE, TABLE_TEXT, label_words, labels_named, labels_of, table_words
@@ -273,7 +273,7 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def mask_for(
-    options: MaskPart | SourceOptions, image: Image, beside: Callable[..., Image], loaded: MeshFile | None
+    options: MaskedPart | SourceOptions, image: Image, beside: Callable[..., Image], loaded: MeshFile | None
 ) -> Image | None:
     """Read the mask of an image's voxels that count: the options', else the one that a mesh's file was built within.
 
@@ -293,7 +293,7 @@ def mask_for(
     return mask
 
 
-def read_mask(options: MaskPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
+def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
     """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`; none without one.
 
     Names of labels are those of the table `names_of`, or else of the mask's own file.
@@ -328,15 +328,15 @@ def read_mask(options: MaskPart | SourceOptions, names_of: Path | None = None) -
     return {(path, resample_mask): Image(np.isin(mask.data, chosen), mask.affine)}
 
 
-def check_part(image: Path | None, part: BoxPart, region: MaskPart, labels: Path | None = None) -> None:
+def check_part(image: Path | None, part: MaskedPart, labels: Path | None = None) -> None:
     """Raise InputError for options that select the voxels of an image if there is none; labels may have a mask."""
-    needs_image: dict[str, Any] = {**stated_part(part), "registered": region.registered or None}
-    needs_image |= {"mask": region.mask, "mask_label": region.mask_label} if labels is None else {}
+    needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
+    needs_image |= {"mask": part.mask, "mask_label": part.mask_label} if labels is None else {}
     if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"`{lost[0]}`: needs `image`")
 
 
-def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshFile) -> Content:
+def content_within(path: Path, part: MaskedPart, loaded: MeshFile) -> Content:
     """Read the image of a mesh's file: `whole`, and as `image` continued beyond the mask of the voxels that count.
 
     Raises
@@ -344,10 +344,10 @@ def content_within(path: Path, part: ImagePart, options: MaskPart, loaded: MeshF
     InputError
         As for `mask_for`; the image's dimension differs from the mesh's.
     """
-    whole, beside, _ = image_and_others(path, part, read_mask(options))
+    whole, beside, _ = image_and_others(path, part, read_mask(part))
     if whole.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
-    mask = mask_for(options, whole, beside, loaded)
+    mask = mask_for(part, whole, beside, loaded)
     beyond = None if mask is None else continuation(mask, whole.spacing)
     return Content(continued(whole, beyond), continuation=beyond, whole=whole)
 

@@ -15,7 +15,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
 from tetopt.job.inputs import check_part, label_table, read_companion, read_mesh, warn_of_other_image
-from tetopt.job.options import NO_MASK, WHOLE_IMAGE, ImagePart, MaskPart, SourceOptions
+from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
@@ -105,7 +105,7 @@ class Judgement(NamedTuple):
 
 def judge(
     mesh: Path, image: Path | None = None, labels: Path | None = None,
-    *, part: ImagePart = WHOLE_IMAGE, region: MaskPart = NO_MASK, label_names: Path | None = None, check: bool = False,
+    *, part: MaskedPart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
 ) -> Judgement:  # fmt: skip
     """Measure a mesh's file: its shape and, given an image, mask and labels, the fit of its cells.
 
@@ -117,10 +117,10 @@ def judge(
         Files cannot be read, or the files that they belong to are missing; the image has a different box
         than that of the mesh's run, unless it is registered and `check` is not requested.
     """
-    check_part(image, part, region)
+    check_part(image, part)
     if image is None and labels is not None:
         raise InputError("`labels`: needs `image`, on whose voxels they are compared")
-    if label_names is not None and labels is None and region.mask_label is None:
+    if label_names is not None and labels is None and part.mask_label is None:
         raise InputError("`label_names`: needs `labels` or `mask_label`")
     loaded = read_mesh(mesh)
     shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
@@ -129,10 +129,10 @@ def judge(
         numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
-        source = _source(loaded, image, region, labels, part, label_names)
-        first, is_registered = source.contrasts[0], region.registered
+        source = _source(loaded, image, labels, part, label_names)
+        first, is_registered = source.contrasts[0], part.registered
         warn_of_other_image(loaded, mesh, image, first, is_registered=is_registered, is_exact=check)
-        has_mask = region.mask is not None or loaded.table("inputs").get("background") is not None
+        has_mask = part.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded, labels).names)
@@ -146,22 +146,21 @@ def judge(
     return judgement
 
 
-def _source(
-    loaded: MeshFile, image: Path, region: MaskPart, labels: Path | None, part: ImagePart, names: Path | None
-) -> Source:
+def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart, names: Path | None) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
     tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
-        images=[image], labels=labels, **vars(part), mask=region.mask, mask_label=region.mask_label,
+        images=[image], labels=labels, mask=part.mask, mask_label=part.mask_label,
+        **{name: getattr(part, name) for name in vars(ImagePart())},
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
     )  # fmt: skip
-    names = None if region.mask_label is None else names
+    names = None if part.mask_label is None else names
     numbers = None if labels is None else _merged(inputs, labels, part)
     return read_source(options, names, numbers=numbers, loaded=loaded)
 

@@ -92,7 +92,7 @@ MaskLabelOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class MaskPart:
-    """Voxels of an image that count for a mesh's file, and whether it may be another image than the mesh's."""
+    """Mask of the voxels that count for a mesh's file, and whether the image may be another than the mesh's."""
 
     mask: Annotated[
         Path | None,
@@ -105,8 +105,13 @@ class MaskPart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelledPart(MaskPart, ImagePart):
-    """Selected part of an image file, and labels for a mesh without them."""
+class MaskedPart(MaskPart, ImagePart):
+    """Selected part of an image file, and the voxels in it that count for a mesh's file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledPart(MaskedPart):
+    """Voxels of an image that count for a mesh's file, and labels for a mesh without them."""
 
     labels: Annotated[
         Path | None,
@@ -114,7 +119,7 @@ class LabelledPart(MaskPart, ImagePart):
     ] = None
 
 
-WHOLE_BOX, WHOLE_IMAGE, NO_MASK = BoxPart(), ImagePart(), MaskPart()
+WHOLE_BOX, WHOLE_IMAGE = BoxPart(), MaskedPart()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -408,9 +413,9 @@ class JobOptions(OutputOptions, SolverOptions, PartsOptions, EngineOptions, Star
     """Every option of a run; `tetopt.job.plan` checks that they are consistent."""
 
 
-def stated_part(part: BoxPart) -> dict[str, int | str | None]:
+def stated_part(part: ImagePart) -> dict[str, int | str | None]:
     """Return the selected part of an image as files of numbers state it."""
-    return {"volume": part.volume, "crop": part.crop, "slice": getattr(part, "slice_", None)}
+    return {"volume": part.volume, "crop": part.crop, "slice": part.slice_}
 
 
 def has_model(options: SolverOptions) -> bool:

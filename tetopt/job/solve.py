@@ -100,7 +100,7 @@ def _check_options(image: Path | None, compress: float | None, model: ModelOptio
         raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
         raise InputError("`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5")
-    check_part(image, part, part, part.labels)
+    check_part(image, part, part.labels)
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
@@ -137,7 +137,7 @@ def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPa
     loaded = with_labels(without_results(read_mesh(path)), part.labels, part)
     about, box, whole, voxels = texts_of(loaded), loaded.box, None, None
     if image is not None:
-        what = content_within(image, part, part, loaded)
+        what = content_within(image, part, loaded)
         whole, voxels = what.given, what.image
         is_other = warn_of_other_image(loaded, path, image, whole, is_registered=part.registered)
         about = texts_of(loaded, is_other=is_other)
