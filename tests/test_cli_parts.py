@@ -1,6 +1,10 @@
 """``tetopt mesh`` in parts: what it refuses, a stored image to a file of pieces, a run cut short that goes on."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +13,9 @@ from commands import assert_refused, exit_code
 
 import tetopt
 from tetopt import load_mesh
+from tetopt.errors import InputError
 from tetopt.io.images import load_image, save_image
-from tetopt.job import in_parts
+from tetopt.job import in_parts, read
 from tetopt.model.fields import cell_fields
 from tetopt.parts.work import save_volume
 
@@ -93,13 +98,14 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, whole, mo
 @pytest.mark.full
 def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypatch, capfd):
     command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300]
-    monkeypatch.setattr(in_parts, "available_bytes", lambda: 1000)
+    for module in (read, in_parts):
+        monkeypatch.setattr(module, "available_bytes", lambda: 1000)
     chosen = []
-    monkeypatch.setattr("tetopt.job.meshing.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
+    monkeypatch.setattr(in_parts, "run_in_parts", lambda *arguments, **_: chosen.append(arguments) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         exit_code(*command)
     assert "meshing in one piece would take" in capfd.readouterr().err
-    assert chosen[0][0].plan.division.n_parts == 1  # as run.json's request has it
+    assert chosen[0][0].request["options"]["parts"] == 1
     # What parts do not do is tried in one piece, as ever: the bound on its memory is a rough one.
     assert exit_code(*command, "--order", 2, "--iterations", 1) == 0
 
@@ -159,6 +165,23 @@ def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, 
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
     assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away and run this again")
     assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize(("n_parts", "nodes"), [(1, 5), (2, 2 * in_parts.FEWEST_NODES_EACH)])
+def test_as_many_parts_as_have_nodes_of_their_own(n_parts, nodes):
+    assert in_parts.checked_number(n_parts, nodes) == n_parts
+    with pytest.raises(InputError, match=rf"`parts`: expected at most {n_parts} for {nodes} nodes \(100 each\), got"):
+        in_parts.checked_number(n_parts + 1, nodes)
+
+
+def test_an_ordinary_image_loads_neither_parts_nor_workers(tmp_path, inputs):
+    words = ["mesh", str(inputs / "ball.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "300", "--iterations", "0"]
+    code = f"import sys, tetopt.cli; print(tetopt.cli.main({words!r})); print('loaded:', *sys.modules)"
+    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    loaded = {name.split(".")[1] for name in done.stdout.splitlines()[-1].split() if name.startswith("tetopt.")}
+    assert {"job", "engine"} <= loaded
+    assert not loaded & {"cohort", "parts", "study", "workers"}
 
 
 def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):

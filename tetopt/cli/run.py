@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -16,8 +15,7 @@ from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
 from tetopt.engine.loop import IterationRecord
 from tetopt.io.text import counted
-from tetopt.job.events import Event, Stage
-from tetopt.job.in_parts import PartsProgress
+from tetopt.job.events import Event, Stage, Step
 from tetopt.job.meshing import left_words
 from tetopt.system.budget import memory_words, resident_bytes
 
@@ -85,8 +83,8 @@ class Display:
                 show(event.data)
 
             self._tell = recorded
-        elif stage.name == "parts":
-            self._tell = self._shown.enter_context(_parts_bar(self._begin_keeping))
+        elif stage.name == "steps":
+            self._tell = self._shown.enter_context(_steps_bar(self._begin_keeping))
         if stage.name in ("optimised", "write"):
             self._n_rows = 0
         self._is_writing = stage.name == "write"
@@ -178,38 +176,34 @@ def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[Iter
 
 
 @contextlib.contextmanager
-def _parts_bar(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Event], None]]:
-    """Yield a function that shows the progress of a run in parts: a bar on a terminal, else lines."""
-    say, number = rare_lines(), -1
+def _steps_bar(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Event], None]]:
+    """Yield a function that shows the tasks of each step: a bar on a terminal, else lines."""
+    say, name = rare_lines(), ""
 
-    def words(at: PartsProgress) -> str:
-        now, history = at
-        kind = {"measure": "measuring", "improve": f"round {now.number}", "fields": "cell fields"}[now.kind]
-        energies = f", E {history[-1].E:.4f}" if history else ""
-        return f"{kind} of {now.n_rounds - 2}{energies}" if now.kind == "improve" else f"{kind}{energies}"
-
-    def follow(event: Event, show: Callable[[Any, str], None]) -> None:
-        nonlocal number
-        if event.data.history:
+    def follow(event: Event, show: Callable[[Step], None]) -> None:
+        if event.data.has_mesh:
             begin_keeping()
-        show(event.data.now, words(event.data))
-        number = event.data.now.number
+        show(event.data)
 
     if log.is_terminal:
-        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} parts")
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[tasks]}")
         with Progress(*columns, console=log, transient=True) as bar:
-            task = bar.add_task("", total=1)
+            task = bar.add_task("", total=1, tasks="")
 
-            def show(now: Any, text: str) -> None:
-                bar.update(task, description=text, completed=now.done, total=now.n_parts)
+            def show(step: Step) -> None:
+                tasks = f"{step.done}/{counted(step.total, step.noun)}"
+                bar.update(task, description=step.name, completed=step.done, total=step.total, tasks=tasks)
 
             yield lambda event: follow(event, show)
     else:
 
-        def tell(now: Any, text: str) -> None:
-            if now.number != number:
-                log.print(f"{text}: {counted(now.n_parts, 'part')}")
+        def tell(step: Step) -> None:
+            nonlocal name
+            tasks = counted(step.total, step.noun)
+            if step.name != name:
+                log.print(f"{step.name}: {tasks}")
             else:
-                say(f"  {now.done} of {counted(now.n_parts, 'part')} done")
+                say(f"  {step.done} of {tasks} done")
+            name = step.name
 
         yield lambda event: follow(event, tell)

@@ -20,9 +20,19 @@ ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "memory limit reached", "
 class Stage(NamedTuple):
     """A stage that a run begins."""
 
-    name: str  # read, start, kernels, optimise, parts, write, ...
+    name: str  # read, start, kernels, optimise, steps, write, ...
     number: int | None  # of iterations
     most_seconds: float | None = None  # after which the stage ends, if limited
+
+
+class Step(NamedTuple):
+    """Progress of a stage in steps, each of several tasks that run at the same time."""
+
+    name: str
+    done: int
+    total: int
+    noun: str  # of a task
+    has_mesh: bool  # that is worth keeping
 
 
 class Event(NamedTuple):

@@ -1,4 +1,4 @@
-"""The optimised mesh of a run: in one piece, or in parts; a target error takes several successive runs."""
+"""The optimised mesh of a run in this process; a target error, or order 2, takes several successive runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from tetopt.engine.requirements import unexplained_by
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, time_words
-from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early, keep_early
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
@@ -39,7 +38,6 @@ from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
-from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes
@@ -54,16 +52,8 @@ START_WORDS = "building the initial mesh"
 
 def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     """Build the optimised mesh; `begin` is the run's start time by `time.perf_counter`."""
-    seconds = task.plan.job.max_seconds
-    ends = None if seconds is None else begin + seconds
-    came = task.plan.division.chosen(_in_one_piece, _in_parts)(task, stop, begin, ends)
-    started("write", "writing and measuring the mesh")
-    return came
-
-
-def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
-    """Run all iterations in this process, in one round; a target error, or order 2, takes several successive runs."""
     job, content, options = task.plan.job, task.source.content, task.plan.engine_options
+    ends = None if job.max_seconds is None else begin + job.max_seconds
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
 
@@ -82,8 +72,8 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
 
     def watch(initial: Mesh, run: Run) -> MeshingResult:
         if not begun:
-            _check_early(task, initial, None)
-        _check_room(task, initial)
+            check_initial(task, initial)
+        check_room(task, initial)
         begun.append(time.perf_counter())
         started("kernels", KERNEL_WORDS)
         nodes = max(job.nodes or 0, len(initial.points)) if task.plan.order == 1 else len(initial.points)
@@ -116,27 +106,12 @@ def _in_one_piece(task: Task, stop: Callable[[], bool], begin: float, ends: floa
     return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
 
 
-def _in_parts(task: Task, stop: Callable[[], bool], begin: float, ends: float | None) -> Meshed:
-    """Run in parts on workers, which also compute the cell fields."""
-    loaded = time.perf_counter() - begin
-
-    def check(initial: Mesh) -> None:
-        early = {name: np.zeros(len(initial.cells)) for name in ("mean", "variance", "n_voxels", "min", "max")}
-        _check_early(task, initial, early | cell_fields(initial))
-        _check_room(task, initial)
-
-    parted, n_bytes = run_in_parts(task, check, stop, ends)
-    seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
-    fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
-    return Meshed(parted.result, parted.result.initial, seconds, {"task_bytes": n_bytes}, fields, is_kept=True)
-
-
-def _check_room(task: Task, initial: Mesh) -> None:
+def check_room(task: Task, initial: Mesh) -> None:
     """Raise InputError if the disk has no room for the cells of the initial mesh."""
     check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
 
 
-def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
+def check_initial(task: Task, initial: Mesh, fields: dict[str, NDArray] | None = None) -> None:
     """Raise InputError for what the writer would reject after the run, as far as the initial mesh shows."""
     job = task.plan.job
     if not has_model(job) and job.output.suffix.lower() == ".vtu":

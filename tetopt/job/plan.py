@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
+from tetopt.engine.memory import meshing_bytes
 from tetopt.engine.meshing import (
     MODE_DEFAULTS,
     QUADRATIC_NODES,
@@ -22,21 +24,21 @@ from tetopt.engine.meshing import (
 from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
-from tetopt.io.images import parse_crop, parse_slice
+from tetopt.io.images import file_shape, parse_crop, parse_slice
 from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.io.stored_images import STORED_SUFFIXES, check_local
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
-from tetopt.parts.division import Division
-from tetopt.parts.work import VolumeFile
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.lattice import KINDS, MAX_NODES
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.files import checked_output, results_folder
 
+VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
 
 
@@ -51,10 +53,6 @@ class Plan(NamedTuple):
         The options, with defaults.
     bare : JobOptions
         The options as given, without defaults.
-    division : Division
-        In one piece, or in parts.
-    left : VolumeFile, optional
-        The image of a run in parts, if it stays in its file.
     pictures : sequence of Path
         Pictures to draw: slice, rho, energies; with a mask, its boundary; with labels, the labels; a thumbnail.
 
@@ -68,8 +66,6 @@ class Plan(NamedTuple):
     mode: Mode
     job: JobOptions
     bare: JobOptions
-    division: Division = Division()
-    left: VolumeFile | None = None
     pictures: Sequence[Path] = ()
 
     @property
@@ -96,6 +92,25 @@ def kind_of(plan: Plan, ndim: int) -> str:
     return plan.job.lattice or KINDS[ndim][0]
 
 
+def whole_bytes(plan: Plan) -> float:
+    """Return the bytes that a graded mesh of an image that could stay in its file takes in one piece; 0 for others."""
+    path = plan.job.images[0]
+    check_local(path)
+    if not path.name.lower().endswith(STORED_SUFFIXES) or plan.job.slice_ is not None or plan.mode != "graded":
+        return 0.0
+    n_voxels = voxels_in_file(plan)
+    return VOXEL_BYTES * n_voxels + meshing_bytes(n_voxels, len(plan.job.images), plan.job.nodes or DEFAULT_NODES[3])
+
+
+def voxels_in_file(plan: Plan) -> int:
+    """Return the number of voxels of the cropped image, by its header."""
+    shape = (file_shape(plan.job.images[0]) or (0,))[:3]
+    if plan.job.crop is None:
+        return prod(shape)
+    bounds = zip(shape, parse_crop(plan.job.crop), strict=False)
+    return prod(len(range(length)[slice(*ends)]) for length, ends in bounds)
+
+
 def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
     """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
@@ -107,7 +122,7 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
         "sizing": None if job.sizing is None else job.sizing.name,
         **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
         "start": None if job.start is None else job.start.name, **plan.engine_options,
-        **plan.division.stated,
+        **({} if job.parts is None else {"parts": job.parts}),
     }  # fmt: skip
 
 

@@ -13,14 +13,16 @@ from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
 from tetopt.job.events import note, started, warning
-from tetopt.job.in_parts import left_source, with_parts
 from tetopt.job.inputs import label_table, read_mesh, set_threads, warn_of_other_image
 from tetopt.job.job import Job
-from tetopt.job.plan import Plan, changed, nodes_of_targets, plan, with_numbers
+from tetopt.job.meshing import meshed
+from tetopt.job.options import PartsOptions, kinds_of
+from tetopt.job.plan import Plan, changed, nodes_of_targets, plan, whole_bytes, with_numbers
 from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
+from tetopt.system.budget import available_bytes
 
 
 def read(job: Job) -> Task:
@@ -57,14 +59,18 @@ def read(job: Job) -> Task:
     checked = plan(job)
     set_threads(job.threads)
     started("read", "reading and preparing the image, with its mask and labels")
-    return read_planned(with_parts(checked))
+    is_asked = any(getattr(job, name) is not None for name in kinds_of(PartsOptions))
+    if is_asked or whole_bytes(checked) > available_bytes():
+        from tetopt.job.in_parts import read_in_parts  # loaded where it is needed, like all that it imports
+
+        return read_in_parts(checked) or read_planned(checked)
+    return read_planned(checked)
 
 
 def read_planned(plan: Plan) -> Task:
-    """Read the files of a plan, and fill in the defaults that depend on them."""
+    """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one piece."""
     begun = None if plan.job.start is None else read_mesh(plan.job.start)
-    source = left_source(plan) or read_source(plan.job, plan.job.label_names, loaded=begun)
-    plan.division.check_image(source.content.image)
+    source = read_source(plan.job, plan.job.label_names, loaded=begun)
     if begun is not None:
         image, path = source.contrasts[0], Path(str(plan.job.start))
         _check_place(begun.mesh, image, str(path))
@@ -79,8 +85,7 @@ def read_planned(plan: Plan) -> Task:
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    request = requested(changed(plan.bare, parts=plan.division.n_parts))
-    return Task(plan, source, begun, sizes, request, by_label)
+    return Task(plan, source, begun, sizes, requested(plan.bare), meshed, by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -23,10 +23,8 @@ from tetopt.job.advice import (
     tell,
     unmet,
 )  # fmt: skip
-from tetopt.job.events import Listener, listened
-from tetopt.job.in_parts import end_parts
+from tetopt.job.events import Listener, listened, started
 from tetopt.job.job import Job
-from tetopt.job.meshing import meshed
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
@@ -129,7 +127,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     begin = time.perf_counter()
     with listened(on), outputs_of_run(vars(job).values()):
         task = read(job)
-        came = meshed(task, stop or (lambda: False), begin)
+        came = task.way(task, stop or (lambda: False), begin)
+        started("write", "writing and measuring the mesh")
         failed: dict[str, str] = {}
         model, about = saved(task, came, failed)
         # Only now, as nothing may fail before the mesh is written.
@@ -149,8 +148,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
             save_json(job.json_path, numbers)
         if undrawn is not None:
             raise undrawn
-        if came.is_kept:
-            end_parts(job.output, came.result)
+        if came.end is not None:
+            came.end()
         return result
 
 

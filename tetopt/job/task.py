@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +36,8 @@ class Task(NamedTuple):
         Targets and limits for the cells' edges.
     request : dict
         Everything that determines the outputs: options, checksums of files, the version.
+    way : callable
+        Builds the optimised mesh of the task, given `stop` of `run` and the run's start time.
     by_label : SizesByLabel, optional
         Sizes of labels, if sizes by label are requested.
 
@@ -51,6 +54,7 @@ class Task(NamedTuple):
     started: MeshFile | None
     sizes: Sizes | None
     request: dict[str, Any]
+    way: Callable[[Task, Callable[[], bool], float], Meshed]
     by_label: SizesByLabel | None = None
 
     @property
@@ -71,11 +75,11 @@ class Meshed(NamedTuple):
     seconds : dict of str to float
         `load`, until the optimisation, and `optimize`.
     memory : dict of str to float
-        The bound of the memory, in bytes, as in run.json: `predicted_bytes`, or in parts `task_bytes`.
+        Bounds of the memory, in bytes, as in run.json.
     fields : dict of str to array, optional
         Fields of the cells, if they came with the mesh.
-    is_kept : bool
-        True if a work directory keeps the mesh until the run is complete.
+    end : callable, optional
+        Ends a complete run; until then, the mesh is kept in other files, too.
     early : Path, optional
         The file that has the mesh already, without measurements, if the run was cut short.
 
@@ -83,8 +87,8 @@ class Meshed(NamedTuple):
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
     >>> meshed = tetopt.run(tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1)).meshed
-    >>> sorted(meshed.seconds), meshed.result.history[-1].iteration, meshed.is_kept
-    (['load', 'optimize'], 1, False)
+    >>> sorted(meshed.seconds), meshed.result.history[-1].iteration
+    (['load', 'optimize'], 1)
     """
 
     result: MeshingResult
@@ -92,5 +96,5 @@ class Meshed(NamedTuple):
     seconds: dict[str, float]
     memory: dict[str, float]
     fields: dict[str, NDArray] | None = None
-    is_kept: bool = False
+    end: Callable[[], None] | None = None
     early: Path | None = None

@@ -77,7 +77,7 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
     places = islice(kept_places(job.output, ".vtu"), 1) if came.early is None else [came.early]
-    early = None if came.is_kept else keep_early(result.mesh, result.labels, places)
+    early = None if came.end is not None else keep_early(result.mesh, result.labels, places)
     if fields is None:
         fields = _measured_fields(source, result, failed)
     try:
