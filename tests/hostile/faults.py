@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 
 # Of each function of `os` that changes what is in folders, the argument that is a path or an open file.
-STEPS = ("open", "fsync", "link", "replace", "rename", "unlink", "remove", "chmod", "chown", "mkdir", "rmdir")
+STEPS = ("open", "fsync", "replace", "rename", "unlink", "remove", "chmod", "chown", "mkdir", "rmdir")
 ALLOCATIONS = ("empty", "zeros", "ones", "full", "empty_like", "zeros_like", "arange", "concatenate", "column_stack")
 FULL_DISK = OSError(errno.ENOSPC, "No space left on device")
 
