@@ -18,7 +18,6 @@ SOURCES = sorted((ROOT / "tetopt").rglob("*.py"))
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
 # More than 8 parameters: public functions, whose signature is a contract.
 WIDE = {
-    "tetopt.cli.quality.quality_command": 9,
     "tetopt.fem.elasticity.compression": 9,
     "tetopt.engine.fast.optimize": 14,
     "tetopt.engine.labelling._mend": 9,

@@ -260,7 +260,7 @@ def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
     )
     (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
     (line,) = refused(small, capsys)
-    assert 'nodes: invalid value "many"; k-d: invalid value "0,9"; write 0.9' in line
+    assert "--nodes: expected a whole number, got 'many'; --k-d: expected a number, got '0,9'; write 0.9" in line
 
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):

@@ -154,9 +154,10 @@ def test_options_of_a_row_replace_those_of_all():
 
 
 @pytest.mark.parametrize(("texts", "words"), [
-    ({"nods": "1"}, "did you mean nodes"), ({"nodes": "1e3"}, "nodes: invalid value .1e3."),
-    ({"nonlinear": "maybe"}, "expected true or false"), ({"iterations": "-1"}, "iterations: invalid value .-1."),
-    ({"method": "Fast"}, "method: invalid value .Fast."), ({"nodes": "9" * 20, "k-d": "x"}, "; k-d: invalid value .x."),
+    ({"nods": "1"}, "did you mean nodes"), ({"nodes": "1e3"}, "`nodes`: expected a whole number, got .1e3."),
+    ({"nonlinear": "maybe"}, "expected True or False"), ({"iterations": "-1"}, "`iterations`: expected 0 or more"),
+    ({"method": "Fast"}, "expected fast or paper, got .Fast."),
+    ({"nodes": "9" * 20, "k-d": "x"}, "; `k_D`: expected a number"),
     ({"json": "a.json"}, "not an option"), ({"help": "1"}, "not an option"),
 ])  # fmt: skip
 def test_options_of_a_row_that_cannot_be(texts, words):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import replace
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Union, get_args, get_origin
 
 from tetopt.errors import InputError
-from tetopt.job.options import Option, RunOptions, kinds_of, near_hint, option_name, option_of
-from tetopt.system.public import LARGEST_INTEGER
+from tetopt.job.job import of_option
+from tetopt.job.options import RunOptions, kinds_of, near_hint, option_name
+
+SWITCH_WORDS = {**dict.fromkeys(("1", "true", "yes"), True), **dict.fromkeys(("0", "false", "no"), False)}
 
 
 def option_words(options: dict[str, Any]) -> list[str]:
@@ -42,33 +45,26 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
             raise InputError(f"{name}: not an option of tetopt mesh" + near_hint(name, kinds))
         field, kind = kinds[name]
         try:
-            values[field] = _value_of(name, get_args(kind)[0], option_of(kind), text)
-        except InputError:  # from a switch
-            raise
-        except ValueError:
+            values[field] = of_option(field, kind, _of_text(get_args(kind)[0], text))
+        except InputError as error:
             point = text.replace(",", ".")
             is_comma = point != text and re.fullmatch(r"-?[0-9]*\.[0-9]+", point)
-            wrong.append(f'{name}: invalid value "{text}"' + (f"; write {point}" if is_comma else ""))
+            wrong.append(f"{error}" + (f"; write {point}" if is_comma else ""))
     if wrong:
         raise InputError("; ".join(wrong))
     return replace(options, **values)
 
 
-def _value_of(name: str, kind: Any, option: Option, text: str) -> Any:
-    """Convert a text to an option's value; raise ValueError if it is invalid."""
+def _of_text(kind: Any, text: str) -> Any:
+    """Return the value of a kind that a text stands for; the text itself if it stands for none."""
     own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     if own is bool:
-        if text.lower() not in ("1", "true", "yes", "0", "false", "no"):
-            raise InputError(f'{name}: expected true or false, got "{text}"')
-        return text.lower() in ("1", "true", "yes")
+        return SWITCH_WORDS.get(text.lower(), text)
     if get_origin(own) is list:
         return [part.strip() for part in text.split(";") if part.strip()] or None
     if own is int:
         text = re.sub(r"\.0+$", "", text)  # as spreadsheets write whole numbers
-    value: Any = text if get_origin(own) is Literal else own(text)
-    least = -LARGEST_INTEGER if option.least is None else option.least
-    is_choice = get_origin(own) is not Literal or value in get_args(own)
-    is_small = own is not int or least <= value <= LARGEST_INTEGER
-    if not (is_choice and is_small):
-        raise ValueError(text)
-    return value
+    if own in (int, float):
+        with suppress(ValueError):
+            return own(text)
+    return text
