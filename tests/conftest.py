@@ -25,7 +25,7 @@ from tetopt.io import apart
 from tetopt.report import summary
 
 # The same examples in every run; few where the kernels run as plain Python.
-settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
+settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 12)
 settings.load_profile("tetopt")
 # As in a terminal, here and in all processes that tests start: in the background of a script SIGINT is ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -44,7 +44,7 @@ def fix_boundary(engine):
     engine.complex.is_frozen[engine.complex.is_frozen.any(axis=1), :3] = True
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seeds, dimensions, st.booleans(), st.booleans(), st.integers(-6, 12))
 def test_exchanges_leave_a_mesh(seed, n, turned, is_graded, more):
     engine = assumed_case(seed, n, OBLIQUE if turned and n == 3 else None, 3.0)
@@ -70,9 +70,9 @@ def test_exchanges_leave_a_mesh(seed, n, turned, is_graded, more):
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("is_fixed", [False, True])
 def test_worth_is_what_E_falls_by(n, is_fixed):
-    """The best split of every fourth node, and its best collapse, made alone."""
+    """The best split of every eighth node, and its best collapse, made alone."""
     count = 0
-    for node in range(0, 40, 4):
+    for node in range(0, 40, 8):
         for kind in ("split", "collapse"):
             engine = random_case(7, n)
             engine.sweep()
@@ -115,7 +115,7 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
             count += 1
             assert E - engine.E == pytest.approx(expected, rel=1e-6, abs=1e-9)
             engine.assert_sound()
-    assert count > 5
+    assert count > 2
 
 
 def test_splits_make_no_edge_shorter_than_asked():

@@ -40,10 +40,10 @@ def smooth_image(shape, affine=None):
 def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
     """The bound by the shape measure never lets one through that is below, and lets most regular ones through."""
     rng = np.random.default_rng(4)
-    corners = rng.normal(size=(4_000, 4, 3))
-    corners[:2_000] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:2_000]
-    corners[1_000:1_500, :, 0] *= 0.2  # flat ones
-    half = np.radians(rng.uniform(1.0, 70.0, 1_000)) / 2.0  # and the very ones that the bound is sharp for
+    corners = rng.normal(size=(800, 4, 3))
+    corners[:400] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:400]
+    corners[200:300, :, 0] *= 0.2  # flat ones
+    half = np.radians(rng.uniform(1.0, 70.0, 200)) / 2.0  # and the very ones that the bound is sharp for
     edge = 0.5 * np.sqrt(1.0 + np.sin(half) ** 2)
     zero = np.zeros_like(half)
     ends = np.stack([np.stack([zero, zero, s * edge], 1) for s in (1, -1)], 1)
@@ -59,7 +59,7 @@ def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
         assert (angles[cosines >= cosine] >= min_dihedral * (1 - 1e-12)).all()
         np.testing.assert_allclose(cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9)
     objective = objective._replace(angle_limit=-0.97, safe=angle_limit_of(12.0)[1])
-    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:800]]) == -0.97).mean() > 0.5
+    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:160]]) == -0.97).mean() > 0.5
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -181,7 +181,7 @@ def test_image_gradient_on_smooth_images(n, turned):
 # Moves.
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seeds, dimensions, st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([1.0, 3.0]), st.booleans())
 def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
     """Sweeps, flips and repairs of random meshes over noise: E falls by what was said, and everything stays sound."""
@@ -223,7 +223,7 @@ def test_flips_at_k_D_0_tend_to_delaunay(n):
     shape = (30, 30, 30)[:n]
     image = tetopt.Image(np.zeros(shape))
     if n == 2:
-        points, cells = split_box(rng, shape, 120)
+        points, cells = split_box(rng, shape, 60)
     else:
         mesh = tetopt.lattice_mesh(image, nodes=800)
         frozen = Engine(image, mesh, 0.0, 1.0).complex.is_frozen[:, :3]
@@ -377,10 +377,10 @@ def test_removing_an_edge_takes_the_best_triangulation():
     ring, around = work.ring, work.around
     cells, across, is_all = engine.complex.cells, engine.complex.across, np.ones(len(engine.cells), dtype=bool)
     edges = gained = 0
-    for cell in range(0, len(engine.cells), 4):
+    for cell in range(0, len(engine.cells), 6):
         for i, j in flips.TET_EDGES:
             m, is_open = flips.ring_of_edge(ring, around, cells, across, cell, i, j, is_all)
-            if m < 3 or is_open:
+            if not 3 <= m <= 7 or is_open:  # of 8 there are 132 triangulations
                 continue
             a, b = engine.complex.cells[cell, i], engine.complex.cells[cell, j]
             worth = flips._worth_of_edge(work, engine.state, a, b, m, is_open)

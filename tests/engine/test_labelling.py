@@ -48,12 +48,12 @@ def box(n, count, seed):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_keeps_topology_as_its_twin(n):
-    """On hundreds of random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
+    """On random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
     rng, n_kept, n_asked = np.random.default_rng(7), 0, 0
     for seed in range(2):
         points, cells = box(n, 25, seed) if seed % 2 else lattice(n, 2)
         across, star = across_of(cells, len(points)), stars(cells, len(points))
-        for _ in range(6):
+        for _ in range(3):
             # Half spaces with noise: few cells of pure noise may change.
             place = points[cells].mean(axis=1) @ rng.normal(size=n)
             labels = np.digitize(place, np.quantile(place, [0.3, 0.6]))
@@ -65,7 +65,7 @@ def test_keeps_topology_as_its_twin(n):
                     n_asked, n_kept = n_asked + 1, n_kept + keeps
                     if keeps:
                         assert_same_topology(cells, labels, cell, label)
-    assert n_asked >= 200
+    assert n_asked >= 100
     assert n_kept > 0.05 * n_asked
 
 
@@ -146,7 +146,7 @@ def test_faults_that_are_skipped_are_none(monkeypatch, n):
 @pytest.mark.full
 def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
-    points, cells = box(3, 12, 4)
+    points, cells = box(3, 8, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
     dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), None, 0.1)
     voxels *= volumes(points, cells).sum() / voxels.sum()

@@ -90,8 +90,8 @@ def test_mesh_image(name):
 @pytest.mark.full
 def test_less_error_than_a_uniform_mesh():
     """At the same number of nodes, from start to end, and at a comparable shape."""
-    image = ball(60, 56, 52, noise=2.0)
-    uniform = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=2000), k_D=0.5).mesh
+    image = ball(40, 38, 36, noise=2.0)
+    uniform = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=1000), k_D=0.5).mesh
     graded = tetopt.mesh_image(image, len(uniform.points)).mesh
     assert abs(len(graded.points) - len(uniform.points)) <= 2
     assert tetopt.E_D(image, graded) < 0.6 * tetopt.E_D(image, uniform)
