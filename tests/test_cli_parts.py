@@ -174,6 +174,25 @@ def test_as_many_parts_as_have_nodes_of_their_own(n_parts, nodes):
         in_parts.checked_number(n_parts + 1, nodes)
 
 
+def test_the_level_that_is_drawn_is_of_the_same_volume(tmp_path, monkeypatch):
+    zarr = pytest.importorskip("zarr")
+    group, h = zarr.open_group(tmp_path / "a.zarr", mode="w"), np.arange(2048, dtype=np.int16).reshape(2, 16, 8, 8)
+    levels = [("0", h, 1.0), ("1", h[:, ::2, ::2, ::2], 2.0)]
+    for name, voxels, _ in levels:
+        group.create_array(name, data=voxels)
+    axes = [{"name": "c", "type": "channel"}, *({"name": name, "unit": "millimeter"} for name in "xyz")]
+    scales = [{"path": name, "coordinateTransformations": [{"type": "scale", "scale": [1.0, *[step] * 3]}]}
+              for name, _, step in levels]  # fmt: skip
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"axes": axes, "datasets": scales}]}
+    monkeypatch.setattr(in_parts, "MOST_LOADED", 0)
+    monkeypatch.setattr(in_parts, "MOST_DRAWN", 200)
+    files = {"images": tmp_path / "a.zarr", "output": tmp_path / "a.vtu", "figures": tmp_path / "figures"}
+    with pytest.warns(UserWarning, match="has no orientation"):
+        task = tetopt.read(tetopt.Job(**files, volume=1, parts=2, nodes=200))
+    assert np.array_equal(task.source.drawn.data, levels[1][1][1])
+    assert np.array_equal(task.source.contrasts[0].read((0, 0, 0), (16, 8, 8)), h[1])
+
+
 def test_an_ordinary_image_loads_neither_parts_nor_workers(tmp_path, inputs):
     words = ["mesh", str(inputs / "ball.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "300", "--iterations", "0"]
     code = f"import sys, tetopt.cli; print(tetopt.cli.main({words!r})); print('loaded:', *sys.modules)"

@@ -104,12 +104,10 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
     InputError
         For the reasons of `open_stored`.
     """
-    check_local(path)
     path = Path(path)
     try:
-        if not is_zarr(path):
-            return None
-        few = [level for level in zarr_levels(path, []) if math.prod(level.shape) <= most_voxels]
+        levels = zarr_levels(path, []) if is_zarr(path) else []
+        few = [level for level in levels if math.prod(level.shape) <= most_voxels]
         if not few:
             return None
         image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume)

@@ -69,23 +69,14 @@ class ZarrLevel(NamedTuple):
 
 
 class _Axes(NamedTuple):
-    """The axes of a multiscale, with the directions and units of the spatial ones."""
+    """The axes of a multiscale."""
 
     names: tuple[str, ...]
-    space: tuple[int, ...]  # numbers of the spatial axes
-    ways: list[tuple[int, float]]  # of the spatial axes: row of the affine and sign
-    mm: NDArray[np.float64] | None  # per unit of the spatial axes, if they have units
+    space: list[int]  # numbers of the spatial axes
+    rows: list[int]  # of the affine, for each spatial axis
+    steps: NDArray[np.float64]  # mm along this row per unit of the axis
     notes: list[str]
-
-    def affine(self, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the affine from index to world mm, (4, 4), for a scale and translation in the units of the axes."""
-        affine = np.zeros((4, 4))
-        affine[3, 3] = 1.0
-        lengths = np.ones(3) if self.mm is None else self.mm
-        for column, (axis, (row, sign), mm) in enumerate(zip(self.space, self.ways, lengths, strict=True)):
-            affine[row, column] = sign * mm * scale[axis]
-            affine[row, 3] = sign * mm * shift[axis]
-        return checked_affine(affine, 3)
+    mm: NDArray[np.float64] | None  # lengths of units, if there are any
 
 
 def is_zarr(path: Path) -> bool:
@@ -147,7 +138,13 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     """
     node = _node(path)
     if hasattr(node, "shape"):
-        return [_single(path, node)]
+        _check_array(node)
+        if (affine := _own_affine(node)) is None:
+            raise InputError(
+                "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it the "
+                'attribute "affine", 4 x 4 numbers from index to world in mm'
+            )
+        return [ZarrLevel(path, node, tuple(f"axis {axis}" for axis in range(node.ndim)), (0, 1, 2), affine)]
     attributes = node.attrs.asdict()
     ome = attributes.get("ome", attributes)
     if not isinstance(ome, dict) or not ome.get("multiscales"):
@@ -259,18 +256,6 @@ def _node(path: Path, name: str = "") -> Any:
         raise InputError(f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again") from error
 
 
-def _single(path: Path, array: Any) -> ZarrLevel:
-    """Return a single array, whose first three axes are spatial."""
-    _check_array(array)
-    affine = _own_affine(array)
-    if affine is None:
-        raise InputError(
-            "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it the "
-            'attribute "affine", 4 x 4 numbers from index to world in mm'
-        )
-    return ZarrLevel(path, array, tuple(f"axis {axis}" for axis in range(array.ndim)), (0, 1, 2), affine)
-
-
 def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLevel]:
     """Return the arrays of a multiscale; errors of `STRUCTURE_ERRORS` if it has another structure than NGFF's."""
     axes, after = _axes_of(scales["axes"]), scales.get("coordinateTransformations", [])
@@ -292,18 +277,21 @@ def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Ax
         raise InputError(f"its metadata has {len(axes.names)} axes, its array {array.ndim}; correct the metadata")
     _check_array(array)
     scale, shift = _scale_and_shift([*dataset["coordinateTransformations"], *after], array.ndim)
-    return ZarrLevel(path / array.path, array, axes.names, axes.space, axes.affine(scale, shift))
+    affine = np.zeros((4, 4))
+    affine[axes.rows, range(3)] = axes.steps * scale[axes.space]
+    affine[axes.rows, 3] = axes.steps * shift[axes.space]
+    affine[3, 3] = 1.0
+    return ZarrLevel(path / array.path, array, axes.names, tuple(axes.space), checked_affine(affine, 3))
 
 
 def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     """Return the axes of a multiscale."""
-    names = tuple(plain(str(axis.get("name"))) for axis in axes)
+    names, notes = tuple(plain(str(axis.get("name"))) for axis in axes), list[str]()
     kinds = [axis.get("type", "space" if axis.get("name") in ("x", "y", "z") else None) for axis in axes]
-    space = tuple(number for number, kind in enumerate(kinds) if kind == "space")
+    space = [number for number, kind in enumerate(kinds) if kind == "space"]
     words = ", ".join(names)
     if len(space) != 3:
         raise InputError(f"expected three spatial axes, got {len(space)} among {words}; only 3-D images are supported")
-    notes: list[str] = []
     units = [axes[number].get("unit") or "" for number in space]
     if not any(units):
         notes.append("has no unit on its axes: assuming mm")
@@ -315,10 +303,10 @@ def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
             "has no orientation: assuming x, y and z are right, anterior and superior; if left/right "
             "matters, give its axes an orientation (NGFF's RFC-4)"
         )
-    turns = [way for way in ways if way is not None]
-    if len({row for row, _ in turns}) < 3:
+    rows, signs = zip(*(way or (None, 0.0) for way in ways), strict=True)
+    if set(rows) != {0, 1, 2}:
         raise _unusable("axes", words, "x, y and z, or three different orientations")
-    return _Axes(names, space, turns, mm, notes)
+    return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), notes, mm)
 
 
 def _scale_and_shift(transforms: list[dict[str, Any]], n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -128,7 +128,7 @@ def _left_source(plan: Plan, left: VolumeFile) -> Source:
         raise InputError(unsupported)
     if plan.job.young is not None:
         note("`young`: a formula or a table is applied to cell means, as the voxels stay in their file")
-    level = coarse_image(path, MOST_DRAWN) if plan.pictures and crop is None else None
+    level = coarse_image(path, MOST_DRAWN, volume=left.volume) if plan.pictures and crop is None else None
     if plan.pictures and level is None:
         raise InputError(
             f"`figures`: {path} is cropped, or has no level of {MOST_DRAWN:.3g} voxels or fewer; leave out `figures`"
