@@ -71,8 +71,6 @@ marks: set[str] = set()
 def pytest_runtest_setup(item):
     marks.clear()
     marks.update(mark.name for mark in item.iter_markers())
-    if "assert_refused" in item.fixturenames:
-        marks.add("apart")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -146,8 +144,7 @@ def scheduler():
 def read_here():
     """Files are read in this process, where a test is not of the child that reads them, which takes half a second.
 
-    Marked `apart`, or with the fixture `assert_refused`, are tests of the child, and of files at which libraries may
-    end the process.
+    Marked `apart` are tests of the child, and of files at which libraries may end the process.
     """
     of_child = apart._of_child
 

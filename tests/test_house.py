@@ -39,6 +39,16 @@ def tree_of(path):
     return ast.parse(text_of(path))
 
 
+@cache
+def nodes_of(path):
+    return list(ast.walk(tree_of(path)))
+
+
+@cache
+def tokens_of(path):
+    return list(tokenize.generate_tokens(io.StringIO(text_of(path)).readline))
+
+
 def module_name(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -73,8 +83,9 @@ def is_numeric(value):
 @cache
 def comment_lines(path):
     """Lines with a comment of words, and those of them that hold nothing else."""
-    tokens = tokenize.generate_tokens(io.StringIO(text_of(path)).readline)
-    comments = [t for t in tokens if t.type == tokenize.COMMENT and not re.match(r"# *(noqa|type:|fmt:)", t.string)]
+    comments = [
+        t for t in tokens_of(path) if t.type == tokenize.COMMENT and not re.match(r"# *(noqa|type:|fmt:)", t.string)
+    ]
     return {t.start[0] for t in comments}, {t.start[0] for t in comments if t.line.lstrip().startswith("#")}
 
 
@@ -85,10 +96,10 @@ def functions():
     rows = []
     for path in SOURCES:
         lines = set()
-        for token in tokenize.generate_tokens(io.StringIO(text_of(path)).readline):
+        for token in tokens_of(path):
             if token.type not in quiet:
                 lines.update(range(token.start[0], token.end[0] + 1))
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 own = {line for line in lines if node.lineno <= line <= node.end_lineno}
                 first = node.body[0]
@@ -159,7 +170,7 @@ def test_variables_are_nouns():
     """No variable, parameter or field is called by one of `VERBS` alone."""
     verbs = []
     for path in SOURCES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             name = getattr(node, "id", None) or getattr(node, "arg", None)
             if isinstance(node, ast.Name | ast.arg) and name in VERBS:
                 verbs.append(f"{module_name(path)}:{node.lineno} {name}")
@@ -184,7 +195,7 @@ def test_no_circle_of_imports():
     edges = {}
     for name, path in modules.items():
         found = set()
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.Import):
                 found.update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -225,7 +236,7 @@ def test_only_the_command_names_options():
         f"{module_name(path)}:{node.lineno} {node.value[:60]!r}"
         for path in SOURCES
         if "cli" not in path.parts and path.name != "bids.py" and module_name(path) not in others
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
         if option.search(re.sub(r"(tetopt|cgal_mesh) [^:`]*", "", node.value))  # whole commands
     ]
@@ -233,7 +244,7 @@ def test_only_the_command_names_options():
 
 
 def test_a_class_name_has_one_meaning():
-    names = Counter(node.name for path in SOURCES for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef))
+    names = Counter(node.name for path in SOURCES for node in nodes_of(path) if isinstance(node, ast.ClassDef))
     assert {name: count for name, count in names.items() if count > 1} == {}
 
 
@@ -244,7 +255,7 @@ def test_only_the_command_prints():
         f"{module_name(path)}:{node.lineno}"
         for path in SOURCES
         if "cli" not in path.parts
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if (isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) in printing)
         or (isinstance(node, ast.Attribute) and node.attr in streams and getattr(node.value, "id", "") == "sys")
     ]

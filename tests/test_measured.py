@@ -82,9 +82,10 @@ def test_a_measurement_replaces_its_entry(measure, tmp_path, monkeypatch):
     command = "tetopt phantom sphere --voxel-mm 8 -o $NAME"
     then = "tetopt mesh sphere.nii.gz -o sphere.vtu --nodes 60 --iterations 1 --json sphere.json --force"
     monkeypatch.setitem(measure.MEASUREMENTS, "small", measure.Measurement((command, then), measure.runs))
-    for _ in range(2):  # what the first leaves is not refused, and not read
-        measure.measure("small", {"NAME": "sphere.nii.gz"}, tmp_path / "small")
-        (tmp_path / "small" / "old.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "small").mkdir()
+    for name in ("sphere.nii.gz", "old.json"):  # of an earlier run: not refused, and not read
+        (tmp_path / "small" / name).write_text("{}", encoding="utf-8")
+    measure.measure("small", {"NAME": "sphere.nii.gz"}, tmp_path / "small")
     entry = json.loads(measure.DATA.read_text(encoding="utf-8"))["small"]
     assert entry["version"] == tetopt.__version__
     assert [row["command"] for row in entry["commands"]] == [command, then]

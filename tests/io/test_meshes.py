@@ -452,6 +452,7 @@ def test_garbage(tmp_path, name, raw, assert_refused):
     assert_refused(tmp_path / name, "damaged|cannot be read|UTF-8")
 
 
+@pytest.mark.apart
 @pytest.mark.full
 @pytest.mark.parametrize("fraction", [0.1, 0.9])
 def test_truncated(tmp_path, fraction, assert_refused):
@@ -520,7 +521,7 @@ def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
         ("0 1 2 3", "inf", "expected finite coordinates, but node 3"),
         ("0 1 2 7", "1", "nodes 0..7, but it has 0..4"),
         ("0 1 2 -1", "1", "nodes -1..2, but it has 0..4"),
-        ("0 1 2", "1", "damaged"),
+        pytest.param("0 1 2", "1", "damaged", marks=pytest.mark.apart),
     ],
 )
 def test_bad_cells(tmp_path, nodes, z, match, assert_refused):
