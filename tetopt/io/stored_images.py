@@ -24,12 +24,10 @@ from tetopt.io.images import (
     nibabel_voxels,
     os_errors_named,
 )
-from tetopt.io.itk_headers import HEADED_SUFFIXES
 from tetopt.io.volumes import VoxelsInFile, check_room
 from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
 
 STORED_SUFFIXES = (ZARR_SUFFIX, ".nii")
-_PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
 
 
 def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> Image:
@@ -157,11 +155,7 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
     name = check_beginning(path)
     if name.endswith(".nii"):
         return _mapped_nifti(path, volume, notes)
-    if name.endswith(HEADED_SUFFIXES):
-        raise InputError("this format cannot be read in parts; convert it to .zarr or uncompressed .nii first")
-    if name.endswith(_PACKED_SUFFIXES):
-        raise InputError("a compressed file cannot be read in parts; unpack it or convert it to .zarr first")
-    raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
+    raise InputError("cannot be read in parts; unpack or convert it to .zarr or uncompressed .nii first")
 
 
 class _Scaled:
