@@ -83,7 +83,7 @@ def test_a_measurement_replaces_its_entry(measure, tmp_path, monkeypatch):
     then = "tetopt mesh sphere.nii.gz -o sphere.vtu --nodes 60 --iterations 1 --json sphere.json --force"
     monkeypatch.setitem(measure.MEASUREMENTS, "small", measure.Measurement((command, then), measure.runs))
     (tmp_path / "small").mkdir()
-    for name in ("sphere.nii.gz", "old.json"):  # of an earlier run: not refused, and not read
+    for name in (measure.LOG, "sphere.nii.gz", "old.json"):  # of an earlier run: not refused, and not read
         (tmp_path / "small" / name).write_text("{}", encoding="utf-8")
     measure.measure("small", {"NAME": "sphere.nii.gz"}, tmp_path / "small")
     entry = json.loads(measure.DATA.read_text(encoding="utf-8"))["small"]
