@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import Image, checked_affine
+from tetopt.image import Image, check_kind, checked_affine
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
@@ -273,8 +273,6 @@ def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLe
 def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Axes) -> ZarrLevel:
     """Return one dataset of a multiscale, with the transformations `after` its own."""
     array = _node(path, dataset["path"])
-    if array.ndim != len(axes.names):
-        raise InputError(f"its metadata has {len(axes.names)} axes, its array {array.ndim}; correct the metadata")
     _check_array(array)
     scale, shift = _scale_and_shift([*dataset["coordinateTransformations"], *after], array.ndim)
     affine = np.zeros((4, 4))
@@ -339,8 +337,7 @@ def _own_affine(array: Any) -> NDArray[np.float64] | None:
 
 def _check_array(array: Any) -> None:
     """Raise InputError for values that are not numbers, no voxels, and chunks larger than memory."""
-    if array.dtype.kind not in "buif":
-        raise InputError(f"expected one real number per voxel, got {plain(str(array.dtype))}; convert it first")
+    check_kind(array.dtype)
     if not 3 <= array.ndim <= ARRAY_AXES or 0 in (*array.shape, *array.chunks, *(array.shards or ())):
         raise InputError(
             f"expected 3 to {ARRAY_AXES} axes with voxels, got shape {array.shape} in chunks of {array.chunks}"
