@@ -20,6 +20,7 @@ import tetopt.cli.run
 import tetopt.job.source
 import tetopt.measure.measures
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
+from tetopt.engine.meshing import Attempt, Search
 
 pytestmark = pytest.mark.deep
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
@@ -334,17 +335,19 @@ def measured_run(tmp_path_factory):
         tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
     words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--edge-size", "9"]
     words += ["--nodes", "60", "--iterations", "3"]
-    real, once = tetopt.job.meshing.mesh_image, []
+    once = []
 
-    def remembered(*arguments, watch, **options):
-        if once:  # what is said and checked before goes on in each run
-            watch(once[0].initial, lambda **_: once[0])
-        else:
-            once.append(real(*arguments, watch=watch, **options))
-        return once[0]
+    class Remembered(Search):
+        def __iter__(self):
+            if once:  # what is said and checked before goes on in each run
+                yield Attempt(once[0].initial, lambda **_: once[0])
+                self.result = once[0]
+            else:
+                yield from super().__iter__()
+                once.append(self.result)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.job.meshing, "mesh_image", remembered)
+        patch.setattr(tetopt.job.meshing, "Search", Remembered)
         exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}

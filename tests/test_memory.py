@@ -23,8 +23,8 @@ from tetopt.engine.memory import BOUND_MARGIN, CHANNEL_BYTES, MESHED_CELL_BYTES,
 from tetopt.engine.meshing import bytes_of, process_bytes
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
-from tetopt.job.events import listened, started
-from tetopt.job.meshing import left_words, prepare, watched
+from tetopt.job.events import listened, progress, started
+from tetopt.job.meshing import left_words, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of
 from tetopt.system import budget
@@ -213,7 +213,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
 
     with closing(cli_run.Display(lambda: None)) as display, listened(display):
         started("kernels")
-        prepare(make)
+        make(progress)
         lines.clear()
         started("optimise", "optimising", 1)
         watched(optimized, LATTICE, 1, None, display.is_over)

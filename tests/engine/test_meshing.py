@@ -1,4 +1,4 @@
-"""The front door: each mode is what its parts make, and watching changes nothing."""
+"""The front door: each mode is what its parts make, and so is a search by attempts."""
 
 import sys
 import threading
@@ -9,7 +9,7 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import plain
-from tetopt.engine.meshing import sizes_of_order
+from tetopt.engine.meshing import Aim, Search, sizes_of_order
 from tetopt.geometry.quadratic import quadratic
 from tetopt.start.clip import lattice_within
 
@@ -92,12 +92,12 @@ def test_no_run_is_repeated(options, n_runs):
     seen = []
     image = tetopt.content(IMAGE, mask=MASK) if "target_error" in options else IMAGE
 
-    def watch(initial, run):
-        seen.append(run())
-        return seen[-1]
-
-    result = tetopt.mesh_image(image, **{"order": 2, "iterations": 2, "watch": watch} | options)
+    search = Search(image, Aim(**{"order": 2} | options), iterations=2)
+    for attempt in search:
+        seen.append(attempt.run())
+        search.tell(seen[-1])
     assert len(seen) == n_runs
+    result = search.result
     assert result.mesh.points.tobytes() == seen[-1].mesh.points.tobytes()
 
 
@@ -134,15 +134,14 @@ def test_a_mesh_to_start_from():
 
 
 @pytest.mark.full
-def test_runs_are_watched():
-    """Each run towards an error is shown its initial mesh, and what it returns is what counts."""
+def test_a_search_by_attempts():
+    """Each run towards an error shows its initial mesh, and what is told is what counts."""
     starts, rows = [], []
-
-    def watch(initial, run):
-        starts.append(initial)
-        return run(callback=rows.append)
-
-    result = tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3, watch=watch)
+    search = Search(IMAGE, Aim(target_error=0.2), iterations=3)
+    for attempt in search:
+        starts.append(attempt.initial)
+        search.tell(attempt.run(callback=rows.append))
+    result = search.result
     assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3))
     assert sum(row.iteration == 0 for row in rows) == len(starts) > 1
     assert any(initial is result.initial for initial in starts)

@@ -22,6 +22,7 @@ from models import sample_image
 
 import tetopt
 import tetopt.job.meshing
+from tetopt.engine.meshing import Attempt, Search
 
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
 
@@ -82,17 +83,19 @@ def table():
 @pytest.fixture
 def runs(monkeypatch):
     """The optimisation once; whether a mesh is there, which may then not be lost."""
-    once, real = {}, tetopt.job.meshing.mesh_image
+    once = {}
 
-    def remembered(*arguments, watch, **options):
-        if not once:
-            once["result"] = real(*arguments, watch=watch, **options)
-        else:  # what is said and checked before goes on in each run
-            watch(once["result"].initial, lambda **_: once["result"])
-        once["is_there"] = True
-        return once["result"]
+    class Remembered(Search):
+        def __iter__(self):
+            if once:  # what is said and checked before goes on in each run
+                yield Attempt(once["result"].initial, lambda **_: once["result"])
+                self.result = once["result"]
+            else:
+                yield from super().__iter__()
+                once["result"] = self.result
+            once["is_there"] = True
 
-    monkeypatch.setattr(tetopt.job.meshing, "mesh_image", remembered)
+    monkeypatch.setattr(tetopt.job.meshing, "Search", Remembered)
     return once
 
 

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from test_octree import OBLIQUE, ball, grid
 
 import tetopt
-from tetopt.engine.meshing import meshed_to_error
+from tetopt.engine.meshing import Aim, Search
 from tetopt.start import octree
 from tetopt.start.octree import _Blocks, _divided, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
@@ -373,20 +373,17 @@ def test_a_stop_keeps_what_has_the_error():
     """A run cut short does not replace a mesh that has the error already; without one it is what there is."""
     image = ball(40, 40, 40)
     for stops_at, has_error in ((1, False), (3, True)):
-        count = []
-
-        def run(mesh, nodes, count=count, stops_at=stops_at):
-            count.append(nodes)
-            stop = (lambda: True) if len(count) >= stops_at else None
-            return tetopt.optimize(image, mesh, k_D=0.85, nodes=nodes, iterations=8, stop=stop)
-
-        result = meshed_to_error(image, 0.0005, None, run)
-        assert len(count) == stops_at
+        initials = []
+        search = Search(image, Aim(target_error=0.0005), iterations=8)
+        for attempt in search:
+            initials.append(attempt.initial)
+            search.tell(attempt.run(stop=(lambda: True) if len(initials) >= stops_at else None))
+        result = search.result
+        assert len(initials) == stops_at
         fraction = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
         assert (fraction <= 0.0005) == has_error
         assert result.ended == "stopped"
-        assert (len(result.history) == 1 or result.nodes == count[-1]) != has_error
-        assert result.nodes in count
+        assert (result.initial is initials[-1]) != has_error
 
 
 @pytest.mark.full

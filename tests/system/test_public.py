@@ -98,7 +98,6 @@ def test_every_public_function_is_in_the_table():
 # Classes in the fields of public records that the package alone looks into: they are handed on as they are.
 INNER = {"Continuation", "Memberships", "PhantomVoxels", "Region", "System"}
 INNER |= {"JobOptions", "SmoothLabels", "Source", "Spread"}  # of runs and contents
-INNER |= {"Run"}  # of `watch` a function; a class of the fast engine has the same name
 
 
 def classes():

@@ -11,8 +11,9 @@ from __future__ import annotations
 import inspect
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from difflib import get_close_matches
+from functools import partial
 from math import prod
 from typing import Any, Literal, NamedTuple
 
@@ -72,6 +73,7 @@ MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the 
     "paper": ("nodes", "spacing", "kind"),
     "start": ("start",),
 }
+AIM_NAMES = ("nodes", "target_error", "spacing", "kind", "start", "sizes")  # in the order in which they are checked
 QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
 NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
@@ -96,7 +98,6 @@ def mesh_image(
     kind: str | None = None,
     k_D: float | None = None,
     iterations: int | None = None,
-    watch: Callable[[Mesh, Run], MeshingResult] | None = None,
     **options: Any,
 ) -> MeshingResult:
     """Mesh an image's box with nodes where the image has detail; or make a uniform mesh, or improve yours.
@@ -136,9 +137,6 @@ def mesh_image(
         larger weights than on a uniform mesh are usual.
     iterations : int
         As for `optimize`, by default 16 for a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
-    watch : callable
-        Called for each run with its initial mesh and a function that does the run; returns the run's result. It may
-        pass a callback: `lambda initial, run: run(callback=print)`.
     **options
         Further options of `optimize` or `optimize_paper`. `max_seconds` counts from the call, over all runs.
 
@@ -184,56 +182,129 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
-    begin = time.perf_counter()
-    mode = ("graded" if start is None else "start") if mode is None else mode
-    _check_names(options, optimize_paper if mode == "paper" else optimize)
-    content = plain(image)
-    values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
-    if mode == "graded" and sizes is not None:
-        sizes = with_label_sizes(sizes, content, nodes, order)[0]
-        if nodes is None and target_error is None:
-            nodes = values["nodes"] = _nodes_of(content, sizes, order)
-    _check_mode(mode, content, values | {"sizes": sizes}, order)
-    options = _with_defaults(mode, options, k_D=k_D, iterations=iterations)
-    sizes = sizes_of_order(content, nodes, sizes, order) if mode == "graded" else sizes
-    if order == 2 and content.smooth is not None:  # curved edges cut nothing off, so corners lie on the surface, too
-        content = content._replace(smooth=content.smooth._replace(band=0.0))
-    seconds: list[float] = []
+    aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind)
+    search = Search(image, aim, k_D=k_D, iterations=iterations, **options)
+    for attempt in search:
+        search.tell(attempt.run())
+    return search.result
 
-    def run(initial: Mesh, nodes: int | None) -> MeshingResult:
-        initial, n_dropped, dropped = (initial, 0, Counter()) if mode == "start" else _carved(initial, content)
-        check_memory_of(content, max(nodes or 0, len(initial.points)))
 
-        def optimized(**more: Any) -> MeshingResult:
-            more = _time_left(options, begin) | more
-            if mode == "paper":
-                return optimize_paper(content.image, initial, **(options | more))
-            exchanged = nodes if mode == "graded" else None
-            return optimize(content, initial, nodes=exchanged, sizes=sizes, **(options | more))
+class Aim(NamedTuple):
+    """The mesh that `mesh_image` is to make, by its arguments."""
 
-        start_of_run = time.perf_counter()
-        result = optimized() if watch is None else watch(initial, optimized)
-        seconds.append(time.perf_counter() - start_of_run)
-        return _with_dropped(result, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
+    nodes: int | None = None
+    target_error: float | None = None
+    sizes: Sizes | None = None
+    order: int = 1
+    mode: Mode | None = None
+    start: Mesh | None = None
+    spacing: float | None = None
+    kind: str | None = None
 
-    def begun(corners: int | None) -> Mesh:
+
+class Attempt(NamedTuple):
+    """A run of a search."""
+
+    initial: Mesh
+    run: Run
+
+
+class Search:
+    """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then take the `result`.
+
+    Parameters are those of `mesh_image`, which raises the same errors.
+    """
+
+    result: MeshingResult
+
+    def __init__(self, image: Image | Content, aim: Aim, **options: Any) -> None:
+        self._begin, self._told = time.perf_counter(), list[MeshingResult]()
+        content = plain(image)
+        mode = ("graded" if aim.start is None else "start") if aim.mode is None else aim.mode
+        _check_names(options, optimize_paper if mode == "paper" else optimize)
+        aim = aim._replace(mode=mode)
+        if mode == "graded" and aim.sizes is not None:
+            sizes = with_label_sizes(aim.sizes, content, aim.nodes, aim.order)[0]
+            is_free = aim.nodes is None and aim.target_error is None
+            aim = aim._replace(sizes=sizes, nodes=_nodes_of(content, sizes, aim.order) if is_free else aim.nodes)
+        _check_aim(content, aim)
+        self._options = _with_defaults(mode, options)
         if mode == "graded":
-            # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as many as they can.
-            return (octree_mesh if order == 1 else nearest_octree)(content, corners or 0, sizes)
-        return lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing)
+            aim = aim._replace(sizes=sizes_of_order(content, aim.nodes, aim.sizes, aim.order))
+        if aim.order == 2 and content.smooth is not None:  # curved edges cut nothing off: corners on the surface, too
+            content = content._replace(smooth=content.smooth._replace(band=0.0))
+        self._content, self._aim = content, aim
 
-    if target_error is not None:
-        result = meshed_to_error(content, target_error, sizes, run)
-    elif start is not None:
-        result = run(start, None)
-    elif order == 2 and nodes is not None:
-        result = meshed_in_all(content.image.ndim, nodes, begun, run, has_exchanges=mode == "graded")
-    else:
-        result = run(begun(nodes), nodes)
-    result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
-    if order == 2:
-        result = _curved(result, content)
-    return result._replace(seconds_start=time.perf_counter() - begin - sum(seconds), seconds_run=sum(seconds))
+    def __iter__(self) -> Iterator[Attempt]:
+        """Yield the attempts, each once the result of the last one is told."""
+        content, steps, seconds = self._content, _searched(self._content, self._aim), 0.0
+        initial, nodes = next(steps)
+        while True:
+            initial, n_dropped, dropped = self._carved(initial)
+            check_memory_of(content, max(nodes or 0, len(initial.points)))
+            start_of_run = time.perf_counter()
+            yield Attempt(initial, partial(self._optimised, initial, nodes))
+            seconds += time.perf_counter() - start_of_run
+            result = _with_dropped(self._told.pop(), n_dropped, dropped)._replace(initial=initial, nodes=nodes)
+            try:
+                initial, nodes = steps.send(result)
+            except StopIteration as end:
+                self.result = self._finished(end.value, seconds)
+                return
+
+    def tell(self, result: MeshingResult) -> None:
+        """Take the result of the attempt."""
+        self._told.append(result)
+
+    def _carved(self, initial: Mesh) -> tuple[Mesh, int, Counter[int]]:
+        """Carve an initial mesh within a mask; also return the number and volumes of dropped components."""
+        content = self._content
+        if content.region is None or self._aim.mode == "start":
+            return initial, 0, Counter()
+        carving = carved(initial, content.image, content.region, content.keeps_components, content.memberships)
+        return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
+
+    def _optimised(self, initial: Mesh, nodes: int | None, **more: Any) -> MeshingResult:
+        """Optimise an initial mesh with further options."""
+        options, mode = self._options | _time_left(self._options, self._begin) | more, self._aim.mode
+        if mode == "paper":
+            return optimize_paper(self._content.image, initial, **options)
+        exchanged = nodes if mode == "graded" else None
+        return optimize(self._content, initial, nodes=exchanged, sizes=self._aim.sizes, **options)
+
+    def _finished(self, result: MeshingResult, seconds: float) -> MeshingResult:
+        """Judge the result by the aim, and curve its surfaces for order 2."""
+        content, aim = self._content, self._aim
+        is_filled = aim.mode != "start" and content.region is None
+        result = requested(result, content, aim.target_error, is_filled)
+        if aim.order == 2:
+            mesh, curving = curved(result.mesh, content, result.labels)
+            result = result._replace(mesh=mesh, curving=curving)
+        return result._replace(seconds_start=time.perf_counter() - self._begin - seconds, seconds_run=seconds)
+
+
+# A search yields initial meshes, with the number of nodes that exchanges lead to, is sent the run's result, and returns
+# the result that counts.
+Steps = Generator[tuple[Mesh, int | None], MeshingResult, MeshingResult]
+
+
+def _searched(content: Content, aim: Aim) -> Steps:
+    """Search for the mesh of an aim."""
+    if aim.target_error is not None:
+        return (yield from meshed_to_error(content, aim.target_error, aim.sizes))
+    if aim.start is not None:
+        return (yield aim.start, None)
+    if aim.order == 2 and aim.nodes is not None:
+        return (yield from meshed_in_all(content, aim))
+    return (yield _initial(content, aim, aim.nodes), aim.nodes)
+
+
+def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
+    """Build the initial mesh with a number of corners."""
+    if aim.mode == "graded":
+        # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as many as they can.
+        return (octree_mesh if aim.order == 1 else nearest_octree)(content, corners or 0, aim.sizes)
+    return lattice_within(content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing)
 
 
 def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
@@ -243,23 +314,9 @@ def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
     return {"max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)}
 
 
-def _curved(result: MeshingResult, content: Content) -> MeshingResult:
-    """Move the mid-edge nodes of interfaces and of a mask's surface onto the smooth levels."""
-    mesh, curving = curved(result.mesh, content, result.labels)
-    return result._replace(mesh=mesh, curving=curving)
-
-
 def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) -> MeshingResult:
     """Add components dropped from the initial mesh to those that a run dropped."""
     return result._replace(n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped))
-
-
-def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int, Counter[int]]:
-    """Carve an initial mesh within a mask; also return the number and volumes of dropped components."""
-    if content.region is None:
-        return initial, 0, Counter()
-    carving = carved(initial, content.image, content.region, content.keeps_components, content.memberships)
-    return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
 
 
 def bytes_of(content: Content, nodes: int) -> float:
@@ -292,9 +349,10 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     check_memory(need, f"{nodes} nodes on {what}", lambda room: at_most((room - bare) / each, "nodes"), limit)
 
 
-def _with_defaults(mode: Mode, options: dict[str, Any], **stated: Any) -> dict[str, Any]:
-    """The options of an optimisation, including stated ones that are not None; else the defaults of the mode."""
-    return MODE_DEFAULTS[mode]._asdict() | options | {name: each for name, each in stated.items() if each is not None}
+def _with_defaults(mode: Mode, options: dict[str, Any]) -> dict[str, Any]:
+    """The options of an optimisation; the defaults of the mode for those that are None or missing."""
+    defaults = MODE_DEFAULTS[mode]._asdict()
+    return defaults | {name: each for name, each in options.items() if each is not None or name not in defaults}
 
 
 def _check_names(options: dict[str, Any], optimisation: Run) -> None:
@@ -327,13 +385,14 @@ def with_label_sizes(
     return (sizes, None) if made is None else (made.sizes, made._replace(nodes=round(many * made.nodes)))
 
 
-def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int) -> None:
+def _check_aim(content: Content, aim: Aim) -> None:
     """Raise InputError for an unknown mode, and for arguments that do not apply to it."""
+    mode, order = aim.mode, aim.order
     if mode not in MODE_DEFAULTS:
         raise InputError(f"mesh_image: expected mode {', '.join(MODE_DEFAULTS)}, got {mode!r}")
     if order not in (1, 2):
         raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
-    names = [name for name, value in values.items() if value is not None]
+    names = [name for name in AIM_NAMES if getattr(aim, name) is not None]
     if unknown := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])
         raise InputError(f"mesh_image: mode {mode!r} takes {takes}, not {unknown[0]}")
@@ -377,20 +436,19 @@ def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bo
     return False
 
 
-def meshed_in_all(
-    ndim: int, nodes: int, begun: Callable[[int], Mesh], run: Callable[[Mesh, int], MeshingResult], has_exchanges: bool
-) -> MeshingResult:
-    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are `nodes`.
+def meshed_in_all(content: Content, aim: Aim) -> Steps:
+    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are the aim's nodes.
 
     Returns the result of the nearest run, or of one that was cut short.
     """
+    nodes, ndim, has_exchanges = int(aim.nodes or 0), content.image.ndim, aim.mode == "graded"
     ratio, runs = QUADRATIC_NODES[ndim], EarlierRuns()
     nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more results are kept
     for _ in range(NODE_RUNS):
-        initial = begun(corners := corners_of(nodes, ndim, ratio))
+        initial = _initial(content, aim, corners := corners_of(nodes, ndim, ratio))
         if _is_repeated(runs, initial, corners, has_exchanges):
             break
-        result = run(initial, corners)._replace(nodes=nodes)
+        result = (yield initial, corners)._replace(nodes=nodes)
         runs.append((initial.points, corners, len(result.mesh.points)))
         if nearest and result.ended in CUT_SHORT:
             return nearest[0][1]._replace(ended=result.ended)
@@ -403,9 +461,7 @@ def meshed_in_all(
     return nearest[0][1]
 
 
-def meshed_to_error(
-    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], MeshingResult]
-) -> MeshingResult:
+def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None) -> Steps:
     """Repeat runs with other numbers of nodes until the unexplained variance is just below a target.
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
@@ -419,7 +475,6 @@ def meshed_to_error(
         A fraction out of range, or below that of the image's noise, which no mesh should follow; as for `octree_mesh`.
     """
     check_target_error(target_error)
-    content = plain(image)
     variance = content.variance
     if variance == 0.0:
         raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
@@ -441,7 +496,7 @@ def meshed_to_error(
             nodes = len(initial.points)
         if _is_repeated(runs, initial, nodes):
             break
-        result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
+        result = yield initial, nodes
         count, fraction = len(result.mesh.points), unexplained_by(content, result.mesh, result.history[-1])
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:

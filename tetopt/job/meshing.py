@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,11 @@ from tetopt.engine.meshing import (
     ERROR_RUNS,
     NODE_RUNS,
     NODES_NEAR,
+    Aim,
     Run,
+    Search,
     bytes_of,
     check_memory_of,
-    mesh_image,
 )
 from tetopt.engine.requirements import unexplained_by
 from tetopt.geometry.quadratic import node_count
@@ -60,7 +60,6 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     def most_bytes(nodes: int) -> float:
         return max(before[0], before[1] + bytes_of(content, nodes))
 
-    begun: list[float] = []
     early: list[Path] = []
 
     def keep(mesh: Mesh, labels: NDArray[np.int64] | None) -> None:
@@ -70,37 +69,30 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         place = keep_early(mesh, labels, early[-1:] or (job.output, *beside))
         early.extend([] if place is None else [place])
 
-    def watch(initial: Mesh, run: Run) -> MeshingResult:
-        if not begun:
+    started("start", START_WORDS)
+    search, first = Search(content, _aim(task), **options), 0.0
+    for number, (initial, run) in enumerate(search, 1):
+        if number == 1:
             check_initial(task, initial)
         check_room(task, initial)
-        begun.append(time.perf_counter())
+        first = first or time.perf_counter()
         started("kernels", KERNEL_WORDS)
         nodes = max(job.nodes or 0, len(initial.points)) if task.plan.order == 1 else len(initial.points)
         note(f"{_described(task, initial)}; at most {memory_words(most_bytes(nodes))} of memory")
-        prepare(lambda say: prepare_kernels(
-            content, options["k_D"], "paper" if task.plan.mode == "paper" else "fast", task.plan.mode == "graded", say
-        ))  # fmt: skip
+        _prepare(task)
         started("optimise", "optimising", options["iterations"], None if ends is None else ends - time.perf_counter())
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
         result = watched(kept, initial, options["iterations"], ends, stop, limit)
-        _say_search(task, len(begun), result)
+        _say_search(task, number, result)
         if job.target_error is not None or job.order == 2:  # a next run may follow
             started("start", START_WORDS)
-        return result
-
-    kind = kind_of(task.plan, content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
-    started("start", START_WORDS)
-    result = mesh_image(
-        content, job.nodes, target_error=job.target_error, mode=task.plan.mode,
-        start=None if task.started is None else task.started.mesh, spacing=job.spacing, kind=kind, sizes=task.sizes,
-        order=task.plan.order, watch=watch, **options,
-    )  # fmt: skip
+        search.tell(result)
+    result = search.result
     if result.curving is not None:
         note(curving_in_words(result.curving))
     elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
         note("`start`: curved edges become straight, as there are no labels or mask for their nodes to follow")
-    seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
+    seconds = {"load": first - begin, "optimize": time.perf_counter() - first}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     memory = {"predicted_bytes": most_bytes(n_nodes)}
     return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
@@ -133,10 +125,19 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
     return MemoryLimit(n_bytes, next_bytes(job.nodes or 0, content.image.ndim))
 
 
-def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
+def _aim(task: Task) -> Aim:
+    """Return the mesh that the run is to make."""
+    plan, job = task.plan, task.plan.job
+    kind = kind_of(plan, task.source.content.image.ndim) if plan.mode in ("uniform", "paper") else None
+    start = None if task.started is None else task.started.mesh
+    return Aim(job.nodes, job.target_error, task.sizes, plan.order, plan.mode, start, job.spacing, kind)
+
+
+def _prepare(task: Task) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
-    begin = time.perf_counter()
-    make(progress)
+    begin, mode = time.perf_counter(), task.plan.mode
+    content, k_D = task.source.content, task.plan.engine_options["k_D"]
+    prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:
         note(f"kernels compiled in {seconds:.0f} s; later runs on similar images load them from the cache")
