@@ -33,13 +33,13 @@ from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined
 from tetopt.parts.part import Kind, Numbers, PartSettings, box_of_ticks, work_on
 from tetopt.parts.work import (
     INITIAL_NAME,
+    STATE_NAME,
     VolumeFile,
     WorkState,
     done_path,
     gone_if_refused,
     load_arrays,
     load_state,
-    mesh_path,
     open_volume,
     round_folder,
     save_arrays,
@@ -210,7 +210,7 @@ def _history(state: WorkState) -> list[IterationRecord]:
 
 def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> list[Piece]:
     """Cut the current mesh into parts."""
-    mesh = load_arrays(mesh_path(run.folder, state.n_rounds))[0]
+    mesh = load_arrays(run.folder / STATE_NAME)[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     part = cut(index[mesh["cells"]].mean(axis=1), _weights(index, mesh["cells"]), counts, shift)
     return pieces(Shared(mesh["ticks"], mesh["cells"], part))

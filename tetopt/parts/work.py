@@ -1,8 +1,8 @@
 """The work directory of a run in parts, which holds its whole state, so that a rerun resumes where it ended.
 
 volume.json, voxels.npy       the location of the voxels; for an image in memory, the voxels themselves
-state.json                    the request, and the state after the last complete round
-mesh-R.npz                    the mesh after round R, only of the last round
+initial.npz                   the initial mesh
+state.npz                     the request, and the state and the mesh after the last complete round
 round-R/part-P.npz            the input of a part of the next round
 round-R/done-P.npz            its result
 
@@ -33,8 +33,8 @@ from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole
 from tetopt.system.work_directory import create, discard
 
-VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
-FILE_NAMES = (VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME, "mesh-*.npz")
+VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.npz", "initial.npz"
+FILE_NAMES = (VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME)
 PART_NAMES = ("part-*.npz", "done-*.npz")  # in the folder of a round
 TEXT_NAME = "text"  # entry of a file of arrays with further information, in JSON
 
@@ -166,12 +166,8 @@ class WorkState(NamedTuple):
 
 
 def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None:
-    """Save a complete round: first its mesh, then the state, which makes it valid; then remove older files."""
-    save_arrays(mesh_path(folder, state.n_rounds), mesh, {})
-    save_json(folder / STATE_NAME, {"state": state._asdict(), "checksum": checksum({}, state._asdict())})
-    for old in folder.glob("mesh-*.npz"):
-        if old != mesh_path(folder, state.n_rounds):
-            old.unlink()
+    """Save a complete round with its mesh; then remove the parts of older ones."""
+    save_arrays(folder / STATE_NAME, mesh, state._asdict())
     for old in folder.glob("round-*"):
         if old != round_folder(folder, state.n_rounds):
             discard(old, PART_NAMES)
@@ -188,24 +184,13 @@ def load_state(folder: Path, request: str) -> WorkState | None:
     path = folder / STATE_NAME
     if not path.exists():
         return None
-    try:
-        words = json.loads(path.read_text("utf-8"))
-        state = WorkState(**words["state"])
-        if words["checksum"] != checksum({}, state._asdict()):
-            raise ValueError("its checksum does not match")
-    except DAMAGE_ERRORS as error:
-        raise _damaged(path, error) from error
+    state = WorkState(**load_arrays(path)[1])
     if state.request != request:
         raise InputError(
             f"{folder}: work directory of another, unfinished run; resume it with the same options and "
             "image, or remove it"
         )
     return state
-
-
-def mesh_path(folder: Path, number: int) -> Path:
-    """Return the path of the mesh after a number of rounds."""
-    return folder / f"mesh-{number}.npz"
 
 
 def round_folder(folder: Path, number: int) -> Path:
