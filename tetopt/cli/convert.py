@@ -46,9 +46,9 @@ def convert_command(
     output = checked_output(output, tuple(FORMATS), numbers.force)
     numbers.check()
     with listened(_show):
-        came = convert_file(mesh_path, output, solver=solver, part=part, image=image_path, results=results_path)
-    numbers.save(came.numbers)
-    print_model(output, came.model, came.options)
+        converted = convert_file(mesh_path, output, solver=solver, part=part, image=image_path, results=results_path)
+    numbers.save(converted.numbers)
+    print_model(output, converted.model, converted.options)
     return 0
 
 

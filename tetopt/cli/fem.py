@@ -62,19 +62,19 @@ def fem_command(
         output = checked_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
         raise InputError("--sets: no file is written; add -o SOLVED.vtu")
-    came = solve_file(
+    solved = solve_file(
         mesh_path, image_path, output, model=model, part=part, compress=compress,
         conditioning=conditioning,
     )  # fmt: skip
-    for first in range(0, len(came.solutions), STEPS_BESIDE):
-        _print(mesh_path.name, came, slice(first, first + STEPS_BESIDE))
-    numbers.save(came.numbers)
+    for first in range(0, len(solved.solutions), STEPS_BESIDE):
+        _print(mesh_path.name, solved, slice(first, first + STEPS_BESIDE))
+    numbers.save(solved.numbers)
     return 0
 
 
-def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
+def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
     """Yield rows on the moduli: the mapping, its average, Poisson's ratios."""
-    model, options, nu = came.model, came.options, came.numbers["materials"]["nu"]
+    model, options, nu = solved.model, solved.options, solved.numbers["materials"]["nu"]
     yield "modulus mapping", "from the mesh's file" if options.young is None else escape(options.young)
     if model.node_young is not None:
         yield "modulus within a cell", "linear between its nodes"
@@ -86,18 +86,20 @@ def _of_what(came: SolvedModel) -> Iterator[tuple[str, str]]:
     yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
-def _print(name: str, came: SolvedModel, shown: slice) -> None:
+def _print(name: str, solved: SolvedModel, shown: slice) -> None:
     """Print a table with a column for each of some steps; that of the first ones describes the model, too."""
-    model, solutions, extremes = came.model, came.solutions[shown], came.extremes if shown.start == 0 else None
-    steps = [f"step {step}" for step in range(1, len(came.solutions) + 1)][shown] if len(came.solutions) > 1 else [""]
+    model, solutions, extremes = solved.model, solved.solutions[shown], solved.extremes if shown.start == 0 else None
+    steps = (
+        [f"step {step}" for step in range(1, len(solved.solutions) + 1)][shown] if len(solved.solutions) > 1 else [""]
+    )
     table = new_table(escape(name), *steps)
     if shown.start == 0:
         moduli = [solutions[0].young.min(), solutions[0].young.max()]
         table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")
         table.add_row("modulus of the cells, kPa", f"{moduli[0]:.4g} to {moduli[1]:.4g}")
-        for title, words in _of_what(came):
+        for title, words in _of_what(solved):
             table.add_row(title, words)
-    of_step = came.numbers["steps"][shown]
+    of_step = solved.numbers["steps"][shown]
     table.add_row("largest displacement, mm", *(f"{each['largest_displacement']:.5g}" for each in of_step))
     table.add_row("largest von Mises stress of a cell, kPa", *(f"{each['largest_von_mises']:.5g}" for each in of_step))
     table.add_row("strain energy, uJ", *(f"{each['strain_energy']:.8g}" for each in of_step))

@@ -38,30 +38,32 @@ def quality_command(
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     numbers.check()
     mesh, image = mesh_and_image(paths, image)
-    came = judge(mesh, image, labels, part=part, label_names=label_names, check=check)
-    numbers.save(came.numbers)
-    size, source = came.numbers["size"], came.source
+    judgement = judge(mesh, image, labels, part=part, label_names=label_names, check=check)
+    numbers.save(judgement.numbers)
+    size, source = judgement.numbers["size"], judgement.source
     table = new_table("", escape(mesh.name))
-    in_all = [size["n_nodes_in_all"]] if came.loaded.order == 2 else []
-    add_quality(table, came.shape, in_all=in_all, jacobian=came.numbers.get("min_scaled_jacobian"), every=every)
-    if source is not None and came.fit is not None:
-        _add_fit(table, came.fit, source, came.left_out, every)
+    in_all = [size["n_nodes_in_all"]] if judgement.loaded.order == 2 else []
+    add_quality(
+        table, judgement.shape, in_all=in_all, jacobian=judgement.numbers.get("min_scaled_jacobian"), every=every
+    )
+    if source is not None and judgement.fit is not None:
+        _add_fit(table, judgement.fit, source, judgement.left_out, every)
     print_table(table)
-    print_fidelity(came.measured, came.loaded.mesh.ndim, came.mask_word, every)
-    if check and not came.numbers["problems"]:
-        print_line(f"checked: conforming, oriented{_checked_words(came)}")
-    wrong = came.tell()
+    print_fidelity(judgement.measured, judgement.loaded.mesh.ndim, judgement.mask_word, every)
+    if check and not judgement.numbers["problems"]:
+        print_line(f"checked: conforming, oriented{_checked_words(judgement)}")
+    wrong = judgement.tell()
     if check:
-        whole = f"{nodes_in_words(came.loaded.mesh, came.loaded.order)}, {size['n_cells']} cells"
-        print_verdict(came.numbers["violated"], f"{mesh}: {whole}")
+        whole = f"{nodes_in_words(judgement.loaded.mesh, judgement.loaded.order)}, {size['n_cells']} cells"
+        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}")
     return int(bool(wrong))
 
 
-def _checked_words(came: Judgement) -> str:
+def _checked_words(judgement: Judgement) -> str:
     """Describe the other properties for which a valid mesh was checked."""
-    if came.is_masked:
+    if judgement.is_masked:
         return "; meshed within a mask, which may have several components"
-    return ", in one piece" + (", fills the box" if came.source is not None and came.is_filled else "")
+    return ", in one piece" + (", fills the box" if judgement.source is not None and judgement.is_filled else "")
 
 
 def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str], every: bool) -> None:

@@ -223,9 +223,9 @@ def _with_pages(outcomes: Iterable[Ended], place: Path) -> Iterator[Ended]:
     refresh_at = time.monotonic() + PAGE_SECONDS
     for ended in outcomes:
         yield ended
-        if (begun := time.monotonic()) > refresh_at:
+        if (start := time.monotonic()) > refresh_at:
             save_cohort_files(place, collect(place))
-            refresh_at = begun + max(PAGE_SECONDS, (time.monotonic() - begun) / PAGE_FRACTION)
+            refresh_at = start + max(PAGE_SECONDS, (time.monotonic() - start) / PAGE_FRACTION)
 
 
 def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -> SubjectTask:
@@ -236,14 +236,14 @@ def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -
 
 def _teller(n_tasks: int, n_at_once: int) -> Callable[[Ended], None]:
     """Return a function that reports a subject's outcome, and the remaining time at the pace of those that ended."""
-    begun, n_done, n_failed = time.monotonic(), 0, 0
+    start, n_done, n_failed = time.monotonic(), 0, 0
     started("subjects", f"{counted(n_tasks, 'subject')}, {max(n_at_once, 1)} at a time", n_tasks)
 
     def tell(ended: Ended) -> None:
         nonlocal n_done, n_failed
         n_done += 1
         n_failed += ended.status == "failed"
-        seconds_left = (time.monotonic() - begun) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
+        seconds_left = (time.monotonic() - start) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
         what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
         memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
         at = CohortProgress(ended, n_done, n_tasks, n_failed, seconds_left)

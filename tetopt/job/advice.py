@@ -223,10 +223,10 @@ def of_empty(
         yield Problem(text, f"reduce `nodes` to about {fewer:.0f}", wants="larger")
 
 
-def tell_label_sizes(made: SizesByLabel) -> None:
+def tell_label_sizes(sizes: SizesByLabel) -> None:
     """Report the nodes that sizes by label take; what the mesh has is measured afterwards (`of_layers`)."""
-    larger = "" if made.scale == 1.0 else f"; with fewer nodes, edges are {made.scale:.2f} times as long"
-    note(f"sizes by label require about {made.nodes} nodes{larger}")
+    larger = "" if sizes.scale == 1.0 else f"; with fewer nodes, edges are {sizes.scale:.2f} times as long"
+    note(f"sizes by label require about {sizes.nodes} nodes{larger}")
 
 
 def of_layers(labels: Iterable[LabelFidelity], cells_across: float, names: Mapping[int, str]) -> Iterator[Problem]:

@@ -25,7 +25,7 @@ from tetopt.system.public import LARGEST_INTEGER
 
 Record = TypeVar("Record")
 FIRST = ("images", "output", "nodes", "mask", "labels", *kinds_of(SizeOptions))  # as users set them
-MOST_SAID = 80  # characters of a value in a message
+SHOWN_LETTERS = 80  # characters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar
 KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a string", bool: "True or False"}
 
@@ -204,7 +204,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         (of_each,) = get_args(own)
         many = [value] if isinstance(value, str | Path) else value
         if not isinstance(many, list | tuple) or not many:
-            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_said(value)}")
+            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_shown(value)}")
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if own is Path and isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value):
@@ -225,7 +225,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if get_origin(own) is Literal and value in choices:
         return value
     expected = " or ".join(map(str, choices)) if choices else KIND_WORDS[own]
-    raise InputError(f"`{name}`: expected {expected}, got {_said(value)}")
+    raise InputError(f"`{name}`: expected {expected}, got {_shown(value)}")
 
 
 def _number_text(value: Any) -> str:
@@ -233,10 +233,10 @@ def _number_text(value: Any) -> str:
     return str(int(value)) if isinstance(value, Integral) else repr(float(value))
 
 
-def _said(value: Any) -> str:
+def _shown(value: Any) -> str:
     """Format a value for a message."""
     text = repr(value)
-    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}..."
+    return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."
 
 
 def _in_words(value: Any) -> Any:

@@ -178,15 +178,19 @@ def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[in
     return {} if np.isin(read_companion(labels, part.spacing_mm).data, list(numbers.values())).all() else numbers
 
 
-def _measured(came: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
+def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
     """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to mask and labels."""
-    source, mesh, of_cell = cast(Source, came.source), came.loaded.mesh, came.loaded.cell_data.get("label")
+    source, mesh, of_cell = (
+        cast(Source, judgement.source),
+        judgement.loaded.mesh,
+        judgement.loaded.cell_data.get("label"),
+    )
     fit = image_fit(source.image, mesh)
-    result = judged(mesh, source.content, of_cell, **came.requirements)
+    result = judged(mesh, source.content, of_cell, **judgement.requirements)
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
-    if not came.is_compared:
+    if not judgement.is_compared:
         measured.pop("mask", None)
     if not source.content.is_plain:
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
@@ -198,19 +202,19 @@ def _number(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _checked(came: Judgement) -> tuple[list[str], list[str]]:
+def _checked(judgement: Judgement) -> tuple[list[str], list[str]]:
     """Return the problems of a mesh; without any, remarks that are no faults.
 
     Non-manifold interfaces of labels are remarks, but problems of a run that smoothed interfaces.
     """
-    mesh, image = came.loaded.mesh, None if came.source is None else came.source.contrasts[0]
-    problems = check_mesh(mesh, image, is_whole=not came.is_masked, is_filled=came.is_filled)
-    labels, touching = came.loaded.cell_data.get("label"), []
+    mesh, image = judgement.loaded.mesh, None if judgement.source is None else judgement.source.contrasts[0]
+    problems = check_mesh(mesh, image, is_whole=not judgement.is_masked, is_filled=judgement.is_filled)
+    labels, touching = judgement.loaded.cell_data.get("label"), []
     if problems or labels is None:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
         touching = manifold_problems(mesh, labels)
-    is_smooth = (_number(came.loaded.table("inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    is_smooth = (_number(judgement.loaded.table("inputs").get("smooth_interfaces")) or 0.0) > 0.0
     return (touching, []) if is_smooth else ([], touching)
 
 

@@ -69,23 +69,23 @@ def read(job: Job) -> Task:
 
 def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one piece."""
-    begun = None if plan.job.start is None else read_mesh(plan.job.start)
-    source = read_source(plan.job, plan.job.label_names, loaded=begun)
-    if begun is not None:
+    start = None if plan.job.start is None else read_mesh(plan.job.start)
+    source = read_source(plan.job, plan.job.label_names, loaded=start)
+    if start is not None:
         image, path = source.contrasts[0], Path(str(plan.job.start))
-        _check_place(begun.mesh, image, str(path))
-        warn_of_other_image(begun, path, source.paths[0], image, is_registered=True)
-        if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
+        _check_place(start.mesh, image, str(path))
+        warn_of_other_image(start, path, source.paths[0], image, is_registered=True)
+        if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed(plan.job, order=2))
         if source.labels is not None and not source.table.names:
-            source = source.with_table(label_table(None, begun))
+            source = source.with_table(label_table(None, start))
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
     if by_label is not None:
         tell_label_sizes(by_label)
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    return Task(plan, source, begun, sizes, requested(plan.bare), meshed, by_label)
+    return Task(plan, source, start, sizes, requested(plan.bare), meshed, by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

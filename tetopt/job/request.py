@@ -17,7 +17,7 @@ from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_op
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
 # Options that do not affect the outputs: names of outputs, threads, and the workers of parts.
-WITHOUT_SAY = (
+OPTIONS_IGNORED = (
     "threads",
     *(each.name for each in (*fields(OutputOptions), *fields(PartsOptions)) if each.name != "parts"),
 )
@@ -40,7 +40,7 @@ def requested(job: JobOptions) -> dict[str, Any]:
         A file is missing or unreadable.
     """
     kinds = kinds_of(JobOptions)
-    left_out = {option_name(name, kinds[name]) for name in WITHOUT_SAY}
+    left_out = {option_name(name, kinds[name]) for name in OPTIONS_IGNORED}
     options = {name: value for name, value in given_options(job).items() if name not in left_out}
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}
     stated = {name: value for name, value in options.items() if name not in files}

@@ -127,17 +127,17 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     begin = time.perf_counter()
     with listened(on), outputs_of_run(vars(job).values()):
         task = read(job)
-        came = task.way(task, stop or (lambda: False), begin)
+        outcome = task.way(task, stop or (lambda: False), begin)
         started("write", "writing and measuring the mesh")
         failed: dict[str, str] = {}
-        model, about = saved(task, came, failed)
+        model, about = saved(task, outcome, failed)
         # Only now, as nothing may fail before the mesh is written.
-        shapes = _shapes(came, failed)
-        measured = measured_of(task, came.result, model, failed)
-        numbers = numbers_of(task, came, shapes, model, about, time.perf_counter() - begin)
+        shapes = _shapes(outcome, failed)
+        measured = measured_of(task, outcome.result, model, failed)
+        numbers = numbers_of(task, outcome, shapes, model, about, time.perf_counter() - begin)
         missing = {name: None for name in (*failed, "cells_without_voxel") if name != "fields"}
         numbers |= missing | measured | model_summary(model)
-        result = Result(came.result.mesh, model, numbers, {}, task, came, shapes, measured)
+        result = Result(outcome.result.mesh, model, numbers, {}, task, outcome, shapes, measured)
         undrawn = _undrawn(result, failed)
         # One list for all: what is told, the exit code, run.json and a cohort's table.
         problems = _problems(result, failed)
@@ -148,8 +148,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
             save_json(job.json_path, numbers)
         if undrawn is not None:
             raise undrawn
-        if came.end is not None:
-            came.end()
+        if outcome.end is not None:
+            outcome.end()
         return result
 
 
@@ -164,27 +164,27 @@ def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
     return None
 
 
-def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
-    meshes = {"quality_initial": came.initial, "quality": came.result.mesh}
+def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
+    meshes = {"quality_initial": outcome.initial, "quality": outcome.result.mesh}
     shapes = measured_each({name: partial(quality, each.points, each.cells) for name, each in meshes.items()}, failed)
     return shapes.get("quality_initial"), shapes.get("quality")
 
 
 def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     """Return violated requirements, failed measurements and oddities, worst first."""
-    task, came, measured = result.task, result.meshed, result.measured
-    problems = list(unmet(came.result.violated, measured, task.source.mask_word))
+    task, outcome, measured = result.task, result.meshed, result.measured
+    problems = list(unmet(outcome.result.violated, measured, task.source.mask_word))
     problems += failures(failed, problems)
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
     n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
-    empty = list(of_empty(came.result, None if mode == "start" else n_nodes, n_empty, spacing))
-    problems = [*empty, *problems] if has_most_empty(came.result, n_empty) else [*problems, *empty]
+    empty = list(of_empty(outcome.result, None if mode == "start" else n_nodes, n_empty, spacing))
+    problems = [*empty, *problems] if has_most_empty(outcome.result, n_empty) else [*problems, *empty]
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
-    problems += of_result(came.result, job.method, mode, n_nodes, expected, measured)
+    problems += of_result(outcome.result, job.method, mode, n_nodes, expected, measured)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
         problems += of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     return agreed(problems)

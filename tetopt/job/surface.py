@@ -71,8 +71,8 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
         raise InputError(f"{mesh}: expected tetrahedra, whose boundary is a surface, got triangles")
     names = label_table(part.label_names, loaded).names
     write = _write_interfaces if part.interfaces or part.interface is not None else _write_closed
-    came = write(loaded, mesh, output, part, names)
-    return came._replace(numbers={"mesh": mesh.name, "surface": output.name} | came.numbers)
+    written = write(loaded, mesh, output, part, names)
+    return written._replace(numbers={"mesh": mesh.name, "surface": output.name} | written.numbers)
 
 
 def _check_part(part: SurfacePart, output: Path) -> None:

@@ -65,19 +65,19 @@ def model_with(
     return solver_model(mesh, source.image.in_memory, solver, fields, about, known_sets)
 
 
-def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
+def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
     """Write the mesh, or save it elsewhere; return the model, and the files' statements about the run.
 
     Until its file is whole, a copy of the mesh is kept next to it, as cell fields are measured first, or in the file
     itself if the run was cut short. Measurements that fail are left out, and noted in `failed`.
     """
-    plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
+    plan, job, source, result, fields = task.plan, task.plan.job, task.source, outcome.result, outcome.fields
     options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
-    places = islice(kept_places(job.output, ".vtu"), 1) if came.early is None else [came.early]
-    early = None if came.end is not None else keep_early(result.mesh, result.labels, places)
+    places = islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
+    early = None if outcome.end is not None else keep_early(result.mesh, result.labels, places)
     if fields is None:
         fields = _measured_fields(source, result, failed)
     try:
@@ -125,20 +125,22 @@ def _table_of(source: Source) -> LabelTable | None:
 
 
 def numbers_of(
-    task: Task, came: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
+    task: Task, outcome: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
 ) -> dict[str, Any]:  # fmt: skip
     """Return every number of a run except measurements: the begin of run.json."""
     source = task.source
     table = _table_of(source)
     texts = {name: text for name, text in about.items() if name != MASK_TEXT}  # which is for the mesh's file
     texts |= {} if table is None else {TABLE_TEXT: table_words(table)}
-    summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
+    summary = run_summary(
+        source.content, outcome.initial, outcome.result, texts, {**outcome.seconds, "all": seconds}, shapes
+    )
     summary["request"] = task.request
     if task.by_label is not None:
         made = task.by_label
         rows = [{"label": row.label, "thickness": row.thickness, "target": row.edge} for row in made.layers]
         summary["label_sizes"] = {"nodes": made.nodes, "scale": made.scale, "labels": rows}
-    return summary | {"memory": {"peak_bytes": peak_bytes(), **came.memory}}
+    return summary | {"memory": {"peak_bytes": peak_bytes(), **outcome.memory}}
 
 
 def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
@@ -161,14 +163,14 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     return measures
 
 
-def draw(task: Task, came: Meshed, model: Model) -> None:
+def draw(task: Task, outcome: Meshed, model: Model) -> None:
     """Draw the pictures."""
     from tetopt.report import figures, thumbnail  # matplotlib loads slowly and is needed only here
 
-    pictures, mesh, source = task.plan.pictures, came.result.mesh, task.source
+    pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
     image = source.drawn
     own = continued(image, source.content.continuation)
-    figures.save_run_figures(pictures[:3], own, came.initial, came.result, task.start_name, image, source.mask)
+    figures.save_run_figures(pictures[:3], own, outcome.initial, outcome.result, task.start_name, image, source.mask)
     of_cell = model.cell_data.get("label")
     if source.mask is not None and "boundary" in pictures[3].stem:  # none for the mask of a mesh to start from
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
