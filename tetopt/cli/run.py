@@ -14,8 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
 from tetopt.engine.loop import IterationRecord
-from tetopt.io.text import counted
-from tetopt.job.events import Event, Stage, Step
+from tetopt.job.events import Event, Stage
 from tetopt.job.meshing import left_words
 from tetopt.system.budget import memory_words, resident_bytes
 
@@ -83,8 +82,10 @@ class Display:
                 show(event.data)
 
             self._tell = recorded
-        elif stage.name == "steps":
-            self._tell = self._shown.enter_context(_steps_bar(self._begin_keeping))
+        elif stage.name in ("measure", "round"):
+            if stage.name == "round":
+                self._begin_keeping()
+            self._tell = self._shown.enter_context(_tasks_bar(text, stage.number or 0))
         if stage.name in ("optimised", "write"):
             self._n_rows = 0
         self._is_writing = stage.name == "write"
@@ -176,34 +177,13 @@ def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[Iter
 
 
 @contextlib.contextmanager
-def _steps_bar(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Event], None]]:
-    """Yield a function that shows the tasks of each step: a bar on a terminal, else lines."""
-    say, name = rare_lines(), ""
-
-    def follow(event: Event, show: Callable[[Step], None]) -> None:
-        if event.data.has_mesh:
-            begin_keeping()
-        show(event.data)
-
+def _tasks_bar(title: str, number: int) -> Iterator[Callable[[Event], None]]:
+    """Yield a function that shows how many tasks have ended: a bar on a terminal, else lines."""
     if log.is_terminal:
-        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[tasks]}")
-        with Progress(*columns, console=log, transient=True) as bar:
-            task = bar.add_task("", total=1, tasks="")
-
-            def show(step: Step) -> None:
-                tasks = f"{step.done}/{counted(step.total, step.noun)}"
-                bar.update(task, description=step.name, completed=step.done, total=step.total, tasks=tasks)
-
-            yield lambda event: follow(event, show)
+        with Progress(TextColumn(title), BarColumn(), MofNCompleteColumn(), console=log, transient=True) as bar:
+            task = bar.add_task("", total=number)
+            yield lambda event: bar.update(task, completed=event.data)
     else:
-
-        def tell(step: Step) -> None:
-            nonlocal name
-            tasks = counted(step.total, step.noun)
-            if step.name != name:
-                log.print(f"{step.name}: {tasks}")
-            else:
-                say(f"  {step.done} of {tasks} done")
-            name = step.name
-
-        yield lambda event: follow(event, tell)
+        log.print(title)
+        say = rare_lines()
+        yield lambda event: say(f"  {event.text}")

@@ -20,19 +20,9 @@ ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "memory limit reached", "
 class Stage(NamedTuple):
     """A stage that a run begins."""
 
-    name: str  # read, start, kernels, optimise, steps, write, ...
-    number: int | None  # of iterations
+    name: str  # read, start, kernels, optimise, measure, round, write, ...
+    number: int | None  # of iterations, or of tasks
     most_seconds: float | None = None  # after which the stage ends, if limited
-
-
-class Step(NamedTuple):
-    """Progress of a stage in steps, each of several tasks that run at the same time."""
-
-    name: str
-    done: int
-    total: int
-    noun: str  # of a task
-    has_mesh: bool  # that is worth keeping
 
 
 class Event(NamedTuple):
@@ -98,7 +88,7 @@ def time_words(seconds: float) -> str:
 
 
 def started(stage: str, text: str = "", number: int | None = None, most_seconds: float | None = None) -> None:
-    """Report that a stage begins, which ends the previous one, its number of iterations and its longest time."""
+    """Report that a stage begins, which ends the previous one; `number` and `most_seconds` as in `Stage`."""
     _LISTENER.get()(Event("started", text, Stage(stage, number, most_seconds)))
 
 

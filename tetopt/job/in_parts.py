@@ -26,8 +26,8 @@ from tetopt.io.images import parse_crop
 from tetopt.io.label_tables import NO_TABLE
 from tetopt.io.stored_images import STORED_SUFFIXES, coarse_image, open_stored
 from tetopt.io.text import counted, plain
-from tetopt.job.events import KERNEL_WORDS, Step, ended_words, note, progress, started, warning
-from tetopt.job.meshing import check_initial, check_room
+from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, warning
+from tetopt.job.meshing import START_WORDS, check_initial, check_room
 from tetopt.job.options import JobOptions, PartsOptions, stated_part
 from tetopt.job.plan import Plan, changed, voxels_in_file, whole_bytes, with_numbers
 from tetopt.job.request import checksum, requested
@@ -160,14 +160,14 @@ def run_in_parts(task: Task, stop: Callable[[], bool], begin: float, volume: Vol
         return stop() or (ends is not None and time.perf_counter() > ends)
 
     def watch(now: Round, history: list[IterationRecord]) -> None:
-        words = {
-            "measure": "measuring",
-            "improve": f"round {now.number} of {now.n_rounds - 2}",
-            "fields": "cell fields",
-        }
-        name = words[now.kind] + (f", E {history[-1].E:.4f}" if history else "")
-        text = f"{now.done} of {counted(now.n_parts, 'part')} of a round"
-        progress(text, Step(name, now.done, now.n_parts, "part", bool(history)))
+        parts = counted(now.n_parts, "part")
+        if now.done > 0:
+            progress(f"{now.done} of {parts} done", now.done)
+        elif not history:
+            started("measure", f"measuring: {parts}", now.n_parts)
+        else:
+            name = f"round {now.number} of {now.n_rounds - 2}" if now.kind == "improve" else "cell fields"
+            started("round", f"{name}, E {history[-1].E:.4f}: {parts}", now.n_parts)
 
     @contextlib.contextmanager
     def crew(n_parts: int, n_bytes: float) -> Iterator[Runner]:
@@ -175,11 +175,11 @@ def run_in_parts(task: Task, stop: Callable[[], bool], begin: float, volume: Vol
         note(f"{counted(n_parts, 'part')} or more per round, each up to {memory_words(n_bytes)}")
         started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
-        started("steps", "optimising in parts")
+        started("start", "starting the workers")
         with _runner(job, folder, n_parts, n_bytes) as runner:
             yield runner
 
-    started("steps", "optimising in parts")
+    started("start", START_WORDS)
     try:
         parted = mesh_in_parts(
             request, folder, task.source.content.statistics, volume=volume, check=check, crew=crew, is_over=is_over,
