@@ -123,7 +123,7 @@ def test_the_boundary_may_be_fixed():
 def test_what_lies_beyond_the_mask_does_not_matter():
     image, mask = shaped("ball")
     other = tetopt.Image(np.where(mask.data > 0, image.data, 1e4 * np.random.default_rng(0).random(image.shape)))
-    meshes = [tetopt.mesh_image(content(each, mask=mask), 500, iterations=4).mesh for each in (image, other)]
+    meshes = [tetopt.mesh_image(content(each, mask=mask), 300, iterations=3).mesh for each in (image, other)]
     np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
     np.testing.assert_array_equal(meshes[0].cells, meshes[1].cells)
 
@@ -138,7 +138,7 @@ def test_same_bits_on_any_number_of_threads():
     try:
         for threads in (1, most):
             numba.set_num_threads(threads)
-            meshes.append(tetopt.mesh_image(target, 700, iterations=6).mesh)
+            meshes.append(tetopt.mesh_image(target, 400, iterations=3).mesh)
     finally:
         numba.set_num_threads(most)
     np.testing.assert_array_equal(meshes[0].points, meshes[1].points)

@@ -170,7 +170,7 @@ def test_a_shell_of_one_cell_is_whole(thickness, percent):
     """Volume, one component, no hole, and hardly any contact of what lies within and without."""
     image = shell_image(36, thickness, 10.0)
     result = tetopt.mesh_image(
-        tetopt.content(image, image, weights=[0.0]), sizes=tetopt.Sizes(edge_size=8.0, cells_across=1)
+        tetopt.content(image, image, weights=[0.0]), sizes=tetopt.Sizes(edge_size=8.0, cells_across=1), iterations=8
     )
     volume = 4.0 / 3.0 * np.pi * ((10.0 + thickness) ** 3 - 10.0**3)
     size = volumes(result.mesh.points, result.mesh.cells)
@@ -219,7 +219,7 @@ def test_facets_on_a_ball_do_not_cut_it_off():
 
 
 def test_corners_of_curved_cells_are_on_the_surface():
-    content, result, _ = meshed_label(BALL, 1200, order=2)
+    content, result, _ = meshed_label(BALL, 600, order=2)
     assert np.mean(off_surface(content, result) < 0.01) > 0.8
 
 

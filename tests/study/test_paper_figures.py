@@ -44,12 +44,12 @@ def simulated(snr):
 
 @pytest.mark.full
 def test_row_1_and_2_random_nodes():
-    """Fig. 1, 20 seeds. The paper shows one draw, made in a way it does not tell.
+    """Fig. 1, 8 seeds. The paper shows one draw, made in a way it does not tell.
 
     Bands: the printed values of (i), (iii) and (iv) lie within a factor of 1.4 of the medians; (ii), which one almost
     regular cell pulls to 0, only has to fall as printed.
     """
-    spread = paper.figure_1_spread(20)
+    spread = paper.figure_1_spread(8)
     for name in ("fig1a", "fig1b"):
         median = np.median(spread[name], axis=0)[:4]
         ratio = median / errors(name)
