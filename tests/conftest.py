@@ -5,8 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import warnings
-from functools import cache
+from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
 
@@ -23,6 +24,7 @@ import tetopt.system.files
 from tetopt.cli import app
 from tetopt.io import apart
 from tetopt.report import summary
+from tetopt.system import budget
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 12)
@@ -46,8 +48,12 @@ def wide_lines(monkeypatch):
 
 @pytest.fixture(scope="session", autouse=True)
 def built_once():
-    """The line of each command is built once, and versions are looked up once: that takes longer than most commands."""
+    """The line of each command is built once, versions are looked up once, and control groups once a second.
+
+    Together they take longer than most commands.
+    """
     build, built = app._app, {}
+    group_bytes, true_folder = budget._group_bytes, budget.GROUP_FOLDER
 
     def kept(arguments):
         name = next((word for word in arguments if not word.startswith("-")), None)
@@ -57,7 +63,16 @@ def built_once():
             built[name] = typer.main.get_command(build(arguments))
         return built[name]
 
+    @lru_cache(1)
+    def of_second(_second):
+        return group_bytes()
+
+    def group_room():
+        is_true = budget.GROUP_FOLDER == true_folder
+        return of_second(int(time.monotonic())) if is_true else group_bytes()
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(budget, "_group_bytes", group_room)
         patch.setattr(app, "_app", kept)
         patch.setattr(summary, "version", cache(summary.version))
         yield
