@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -203,19 +203,29 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 
 
 def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
-    """Run the subjects, and report each outcome."""
-    place, cohort, estimate = plan.place.absolute(), plan.cohort, plan.estimate
-    share = share_for(len(to_run), estimate, cohort, plan.threads)
+    """Run the subjects, and report each outcome and the remaining time at the pace of those that ended."""
+    place, cohort, n_tasks, n_failed = plan.place.absolute(), plan.cohort, len(to_run), 0
+    share = share_for(n_tasks, plan.estimate, cohort, plan.threads)
     try:
         with workers(share, cohort.scheduler, plan.threads) as pool:
             note(pool.words())
-            tasks = [_task(entry, estimate, place, plan.suffix) for entry in to_run]
+            tasks = [_task(entry, plan.estimate, place, plan.suffix) for entry in to_run]
             tasks.sort(key=lambda task: -task.n_bytes)  # so that no large run remains alone at the end
-            tell = _teller(len(tasks), pool.slots())
-            for ended in _with_pages(run_all(tasks, pool, place), place):
-                tell(ended)
+            started("subjects", f"{counted(n_tasks, 'subject')}, {max(pool.slots(), 1)} at a time", n_tasks)
+            start = time.monotonic()
+            for n_done, ended in enumerate(_with_pages(run_all(tasks, pool, place), place), start=1):
+                n_failed += ended.status == "failed"
+                left = (time.monotonic() - start) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
+                progress(_outcome_words(ended), CohortProgress(ended, n_done, n_tasks, n_failed, left))
     except SchedulerLost as lost:
         violated(f"{lost}; finished subjects are kept")
+
+
+def _outcome_words(ended: Ended) -> str:
+    """Describe the outcome of a run in one line."""
+    what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
+    memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
+    return f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})"
 
 
 def _with_pages(outcomes: Iterable[Ended], place: Path) -> Iterator[Ended]:
@@ -232,21 +242,3 @@ def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -
     command = shlex.join(["tetopt", "mesh", "-o", f"{entry.key}{suffix}", *entry.words()])
     job = changed(entry.plan.bare, threads=None)  # its worker's
     return SubjectTask(entry.key, job, suffix, place, estimate.get(entry.key, 0.0), command)
-
-
-def _teller(n_tasks: int, n_at_once: int) -> Callable[[Ended], None]:
-    """Return a function that reports a subject's outcome, and the remaining time at the pace of those that ended."""
-    start, n_done, n_failed = time.monotonic(), 0, 0
-    started("subjects", f"{counted(n_tasks, 'subject')}, {max(n_at_once, 1)} at a time", n_tasks)
-
-    def tell(ended: Ended) -> None:
-        nonlocal n_done, n_failed
-        n_done += 1
-        n_failed += ended.status == "failed"
-        seconds_left = (time.monotonic() - start) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
-        what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
-        memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
-        at = CohortProgress(ended, n_done, n_tasks, n_failed, seconds_left)
-        progress(f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})", at)
-
-    return tell

@@ -35,7 +35,7 @@ def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
     known: dict[object, dict[object, float | None]] = {}  # by kind and shape; None if not readable
     shapes = {}
     for entry in entries:
-        job = entry.job
+        job = entry.plan.job
         files = len(job.images), job.mask is None, job.labels is None, job.tissues is None
         kind = (*files, job.background, *(getattr(job, field.name) for field in fields(SizeOptions)))
         with contextlib.suppress(InputError):  # its run will report it

@@ -90,7 +90,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     for ndim, places in _groups(rows).items():
         own = [rows[place] for place in places]
         names = {number: name for row in reversed(own) for number, name in row.label_names.items()}
-        for flagged_by in (_violations, _lost, _absent, _grids):
+        for flagged_by in (_violations, _absent, _grids):
             for place, flag in flagged_by(own, names):
                 flags[places[place]].append(flag)
         dimension = 2 if ndim == 2 else 3
@@ -154,10 +154,6 @@ def _violations(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         for name in row.violated:
             if not (name == "labels" and row.n_lost):
                 yield place, Flag("violated", f"violated {name}", np.inf)
-
-
-def _lost(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    for place, row in enumerate(rows):
         for number, n_voxels in row.n_lost.items():
             words = f"lost label {label_words(number, names)}"
             yield place, Flag("label", f"{words}: it has {n_voxels} voxels but no cell", np.inf)

@@ -43,11 +43,6 @@ class PlannedSubject(NamedTuple):
     plan: Plan  # of its run, as far as known without its files
     state: SubjectState
 
-    @property
-    def job(self) -> JobOptions:
-        """The subject's job, with its images."""
-        return self.plan.job
-
     def row(self) -> Subject:
         """Return the subject with the files that patterns match."""
         files = {name: str(path) for name in FILE_OPTIONS if (path := getattr(self.plan.bare, name)) is not None}

@@ -82,7 +82,7 @@ def read_table(path: Path) -> list[Subject]:
             problems.append(f"{place}: expected {len(columns)} cells as in the first line, got {len(line)}")
             continue
         cells = {name: cell for name, cell in zip(columns, line, strict=True) if name and cell not in NO_VALUES}
-        images = sorted((name for name in cells if IMAGE_PATTERN.match(name)), key=_image_number)
+        images = sorted(filter(IMAGE_PATTERN.match, cells), key=lambda name: (len(name), name))
         if missing := [name for name in ("subject", "image") if name not in cells]:
             problems.append(f"{place}: missing {' and '.join(missing)}")
             continue
@@ -122,8 +122,8 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             yield f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; give both a session"
 
 
-def table_text(path: Path, subjects: Sequence[Subject]) -> str:
-    """Format the subjects as a table at `path`, for `read_table`."""
+def write_table(path: Path, subjects: Sequence[Subject]) -> None:
+    """Write the subjects as a table for `read_table`, whole or not at all."""
     folder = path.parent.resolve()
     n_images = max((len(each.images) for each in subjects), default=1)
     images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
@@ -141,7 +141,7 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
         row = {"subject": each.subject, **({"session": each.session} if each.session else {})}
         row |= {name: os.path.relpath(image, folder) for name, image in zip(images, each.images, strict=False)}
         writer.writerow(row | with_files(each.options, partial(os.path.relpath, start=folder)))
-    return stream.getvalue()
+    save_text(path, stream.getvalue())
 
 
 def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -> dict[str, str]:
@@ -154,11 +154,6 @@ def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -
         elif name in FILES_IN_TEXTS and named_file(text) is not None:
             changed[name] = str(function(text))
     return options | changed
-
-
-def write_table(path: Path, subjects: Sequence[Subject]) -> None:
-    """Write the subjects as a table, whole or not at all."""
-    save_text(path, table_text(path, subjects))
 
 
 def matching(pattern: str, subject: Subject) -> Path:
@@ -220,11 +215,6 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
             f"missing {' and '.join(missing)}"
         )
     return columns
-
-
-def _image_number(name: str) -> int:
-    match = IMAGE_PATTERN.match(name)
-    return int(match[1] or 1) if match else 0
 
 
 def _absolute(folder: Path, cell: str) -> Path:
