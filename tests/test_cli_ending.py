@@ -20,7 +20,7 @@ import tetopt.cli.run
 import tetopt.job.source
 import tetopt.measure.measures
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
-from tetopt.engine.meshing import Attempt, Search
+from tetopt.engine.meshing import Attempt, MeshSearch
 
 pytestmark = pytest.mark.deep
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
@@ -337,7 +337,7 @@ def measured_run(tmp_path_factory):
     words += ["--nodes", "60", "--iterations", "3"]
     once = []
 
-    class Remembered(Search):
+    class Remembered(MeshSearch):
         def __iter__(self):
             if once:  # what is said and checked before goes on in each run
                 yield Attempt(once[0].initial, lambda **_: once[0])
@@ -347,7 +347,7 @@ def measured_run(tmp_path_factory):
                 once.append(self.result)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.job.meshing, "Search", Remembered)
+        patch.setattr(tetopt.job.meshing, "MeshSearch", Remembered)
         exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}

@@ -9,7 +9,7 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import plain
-from tetopt.engine.meshing import Aim, Search, sizes_of_order
+from tetopt.engine.meshing import Aim, MeshSearch, sizes_of_order
 from tetopt.geometry.quadratic import quadratic
 from tetopt.start.clip import lattice_within
 
@@ -92,7 +92,7 @@ def test_no_run_is_repeated(options, n_runs):
     seen = []
     image = tetopt.content(IMAGE, mask=MASK) if "target_error" in options else IMAGE
 
-    search = Search(image, Aim(**{"order": 2} | options), iterations=2)
+    search = MeshSearch(image, Aim(**{"order": 2} | options), iterations=2)
     for attempt in search:
         seen.append(attempt.run())
         search.tell(seen[-1])
@@ -137,7 +137,7 @@ def test_a_mesh_to_start_from():
 def test_a_search_by_attempts():
     """Each run towards an error shows its initial mesh, and what is told is what counts."""
     starts, rows = [], []
-    search = Search(IMAGE, Aim(target_error=0.2), iterations=3)
+    search = MeshSearch(IMAGE, Aim(target_error=0.2), iterations=3)
     for attempt in search:
         starts.append(attempt.initial)
         search.tell(attempt.run(callback=rows.append))

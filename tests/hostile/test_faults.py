@@ -22,7 +22,7 @@ from models import sample_image
 
 import tetopt
 import tetopt.job.meshing
-from tetopt.engine.meshing import Attempt, Search
+from tetopt.engine.meshing import Attempt, MeshSearch
 
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
 
@@ -85,7 +85,7 @@ def runs(monkeypatch):
     """The optimisation once; whether a mesh is there, which may then not be lost."""
     once = {}
 
-    class Remembered(Search):
+    class Remembered(MeshSearch):
         def __iter__(self):
             if once:  # what is said and checked before goes on in each run
                 yield Attempt(once["result"].initial, lambda **_: once["result"])
@@ -95,7 +95,7 @@ def runs(monkeypatch):
                 once["result"] = self.result
             once["is_there"] = True
 
-    monkeypatch.setattr(tetopt.job.meshing, "Search", Remembered)
+    monkeypatch.setattr(tetopt.job.meshing, "MeshSearch", Remembered)
     return once
 
 

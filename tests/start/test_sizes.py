@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from test_octree import OBLIQUE, ball, grid
 
 import tetopt
-from tetopt.engine.meshing import Aim, Search
+from tetopt.engine.meshing import Aim, MeshSearch
 from tetopt.start import octree
 from tetopt.start.octree import _Blocks, _divided, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
@@ -374,7 +374,7 @@ def test_a_stop_keeps_what_has_the_error():
     image = ball(40, 40, 40)
     for stops_at, has_error in ((1, False), (3, True)):
         initials = []
-        search = Search(image, Aim(target_error=0.0005), iterations=8)
+        search = MeshSearch(image, Aim(target_error=0.0005), iterations=8)
         for attempt in search:
             initials.append(attempt.initial)
             search.tell(attempt.run(stop=(lambda: True) if len(initials) >= stops_at else None))

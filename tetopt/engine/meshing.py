@@ -183,7 +183,7 @@ def mesh_image(
     True
     """
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind)
-    search = Search(image, aim, k_D=k_D, iterations=iterations, **options)
+    search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
     for attempt in search:
         search.tell(attempt.run())
     return search.result
@@ -209,7 +209,7 @@ class Attempt(NamedTuple):
     run: Run
 
 
-class Search:
+class MeshSearch:
     """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then take the `result`.
 
     Parameters are those of `mesh_image`, which raises the same errors.

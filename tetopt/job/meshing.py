@@ -22,8 +22,8 @@ from tetopt.engine.meshing import (
     NODE_RUNS,
     NODES_NEAR,
     Aim,
+    MeshSearch,
     Run,
-    Search,
     bytes_of,
     check_memory_of,
 )
@@ -70,7 +70,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         early.extend([] if place is None else [place])
 
     started("start", START_WORDS)
-    search, first = Search(content, _aim(task), **options), 0.0
+    search, first = MeshSearch(content, _aim(task), **options), 0.0
     for number, (initial, run) in enumerate(search, 1):
         if number == 1:
             check_initial(task, initial)
