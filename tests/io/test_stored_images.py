@@ -344,6 +344,12 @@ def test_coarse_levels_of_an_oblique_image(tmp_path):
     np.testing.assert_allclose(coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5]))
 
 
+def test_no_more_levels_are_opened_than_halving_gives(tmp_path):
+    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"))
+    changed(path, lambda scales, _: scales.update(datasets=1000 * scales["datasets"]))
+    assert len(zarr_images.zarr_levels(path, [])) == zarr_images.MOST_LEVELS
+
+
 # Folders that are no image
 
 
