@@ -117,7 +117,7 @@ class _CohortDisplay:
 
     def _close(self, rows: Sequence[Row]) -> None:
         """Print the summary of all subjects."""
-        place, keys = self._plan.place, set(self._plan.keys)
+        place, keys = self._plan.cohort.output, set(self._plan.keys)
         own = [row for row in rows if row.key in keys]
         counts = Counter[str](row.status for row in own)
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:

@@ -46,11 +46,6 @@ class CohortPlan(NamedTuple):
     to_run: list[PlannedSubject]
     estimate: Estimate  # of the subjects to run
 
-    @property
-    def place(self) -> Path:
-        """The folder of all outputs."""
-        return self.cohort.output
-
 
 class CohortProgress(NamedTuple):
     """Progress of a cohort."""
@@ -178,7 +173,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 
     The rows are reported in a stage "collected", even if the run is interrupted.
     """
-    place, keys, cohort = plan.place, plan.keys, plan.cohort
+    place, keys, cohort = plan.cohort.output, plan.keys, plan.cohort
     # Other runs may use the same folder.
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
     begin(place, [plan.subjects.absolute().as_uri()])
@@ -204,7 +199,7 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 
 def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
     """Run the subjects, and report each outcome and the remaining time at the pace of those that ended."""
-    place, cohort, n_tasks, n_failed = plan.place.absolute(), plan.cohort, len(to_run), 0
+    place, cohort, n_tasks, n_failed = plan.cohort.output.absolute(), plan.cohort, len(to_run), 0
     share = share_for(n_tasks, plan.estimate, cohort, plan.threads)
     try:
         with workers(share, cohort.scheduler, plan.threads) as pool:

@@ -6,7 +6,6 @@ import base64
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,8 +15,7 @@ from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row, Value, description, present, save_table
 from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
 
-PAGE_NUMBERS = 1_500_000  # in the page at most, about 10 MB: a browser on a phone reads them in seconds
-PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64; with more subjects, the flagged ones and a sample
+PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64
 LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
 LISTED_FLAGS = 6  # per subject; the TSV table has all
 SHOWN_DIGITS = 4  # of numbers in the page
@@ -48,52 +46,24 @@ STATUS_WORDS: dict[str, str] = {
 def save_cohort_files(out: Path, rows: Sequence[Row]) -> None:
     """Write `cohort.tsv`, `cohort.json` with descriptions of its columns, and `cohort.html` to a cohort's folder.
 
-    Each is written whole or not at all, replacing an existing file.
+    Each is written whole or not at all, replacing an existing file. The page contains everything except linked files,
+    and forbids all network access. Its numbers are rounded to four digits.
     """
     flags = flags_of(rows)
     save_table(out / TABLE_NAME, rows, [[flag.words for flag in each] for each in flags])
-    save_cohort_page(out / PAGE_NAME, out, rows, flags)
-
-
-def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> None:
-    """Write the page as one HTML file, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        Path in the cohort's folder, as links are relative to it.
-    out : Path
-        The cohort's folder, with the pictures.
-    rows : sequence of Row
-    flags : sequence of sequence of Flag
-        Flags of each row; see `tetopt.cohort.flags.flags_of`.
-
-    Notes
-    -----
-    The page contains everything except linked files, and forbids all network access. Numbers are rounded to four
-    digits; above `PAGE_NUMBERS` of them, labels are left out, the most common ones last. Above `PAGE_PICTURES`
-    subjects, only flagged ones, and an evenly spaced sample of the others, have embedded pictures.
-    """
     pictures = _pictures(out, rows, flags)
-    names, left_out = _columns(rows)
     is_solid = any(row.numbers.get("quality.ndim") == 3 for row in rows)
-    n_pictures = sum(picture is not None for picture in pictures)
     note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image. " if is_solid else ""
-    note += COLOUR_WORDS if n_pictures else ""
-    if n_pictures < sum("thumbnail" in row.files for row in rows):
-        note += (
-            f" The page has {n_pictures} of them: those of flagged subjects, and a sample of the others; the rest are "
-            "linked."
-        )
-    if left_out:
-        note += f" Numbers of {left_out} more labels are only in cohort.tsv."
+    note += COLOUR_WORDS if pictures else ""
+    if len(pictures) < sum("thumbnail" in row.files for row in rows):
+        note += f" The page has {len(pictures)} of them, flagged subjects first; the rest are linked."
     reasons = _failures(rows)
     content = rendered(
         "cohort/cohort.html", summary=_summary(rows, flags), reasons=reasons, most=LISTED_FAILURES, quote=quote,
         n_failed=sum(len(failed) for _, failed in reasons), note=note,
-        data=data_html("data", _data(rows, flags, pictures, names)), script=script_html("cohort"),
+        data=data_html("data", _data(rows, flags, pictures, _columns(rows))), script=script_html("cohort"),
     )  # fmt: skip
-    write_page(path, f"Cohort {out.resolve().name}", content, package_text("cohort/cohort.css"))
+    write_page(out / PAGE_NAME, f"Cohort {out.resolve().name}", content, package_text("cohort/cohort.css"))
 
 
 def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
@@ -147,24 +117,20 @@ def _failures(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     return sorted(reasons.items(), key=lambda each: -len(each[1]))
 
 
-def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str | None]:
-    """Return thumbnails in base64 for as many rows as allowed: flagged ones first, and evenly spaced others."""
+def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> dict[str, str]:
+    """Return thumbnails in base64 of `PAGE_PICTURES` rows at most, by place, the flagged ones first."""
     places = [place for place, row in enumerate(rows) if "thumbnail" in row.files]
-    odd = sorted((place for place in places if flags[place]), key=lambda place: -flags[place][0].score)
-    rest = [place for place in places if not flags[place]]
-    # At least a fifth shows usual subjects.
-    n_odd = min(len(odd), max(PAGE_PICTURES - len(rest), 4 * PAGE_PICTURES // 5))
-    n_rest = min(len(rest), PAGE_PICTURES - n_odd)
-    chosen = chain(odd[:n_odd], (rest[k * len(rest) // n_rest] for k in range(n_rest)))
-    pictures: list[str | None] = [None] * len(rows)
-    for place in chosen:
+    places.sort(key=lambda place: -flags[place][0].score if flags[place] else 0.0)
+    pictures = {}
+    for place in places[:PAGE_PICTURES]:
         with suppress(OSError):  # the page does without it
-            pictures[place] = base64.b64encode((out / rows[place].files["thumbnail"]).read_bytes()).decode("ascii")
+            png = (out / rows[place].files["thumbnail"]).read_bytes()
+            pictures[str(place)] = base64.b64encode(png).decode("ascii")
     return pictures
 
 
-def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
-    """Return the page's columns, by name, and the number of labels left out."""
+def _columns(rows: Sequence[Row]) -> dict[str, Quantity]:
+    """Return the page's columns, by name."""
     known = {name for row in rows for name in row.numbers}
     quantities = {each.column: each for each in QUANTITIES}
     columns = {name: quantities.get(name) for name in dict.fromkeys((*FIRST_COLUMNS, *quantities, *PAGE_COLUMNS))}
@@ -177,16 +143,13 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
     for name, each in sorted(_options(rows).items()):
         if name.startswith(OPTION_BEGINNINGS) and len(each) > 1:
             shown[name] = Quantity(name, _option(name), "", "both", False, 0.0)
-    counts = Counter(number for row in rows for number in row.volumes if number > 0)
+    labels = sorted({number for row in rows for number in row.volumes if number > 0})
     names = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
-    room = max(PAGE_NUMBERS // max(len(rows), 1) - len(shown), 0) // 2
-    labels = sorted(number for number, _ in counts.most_common(room))
-    shown |= {each.column: each for number in labels for each in label_quantities(number, names)}
-    return shown, len(counts) - len(labels)
+    return shown | {each.column: each for number in labels for each in label_quantities(number, names)}
 
 
 def _data(
-    rows: Sequence[Row], flags: Sequence[Sequence[Flag]], pictures: Sequence[str | None], columns: dict[str, Quantity]
+    rows: Sequence[Row], flags: Sequence[Sequence[Flag]], pictures: dict[str, str], columns: dict[str, Quantity]
 ) -> dict[str, Any]:
     """Return the script's data."""
     is_flat = any(row.numbers.get("quality.ndim") == 2 for row in rows)
@@ -202,7 +165,7 @@ def _data(
         ],
         "volume": "mm^2" if is_flat else "mm^3",
         "rows": [_row_data(row, own, columns) for row, own in zip(rows, flags, strict=True)],
-        "pictures": {str(place): picture for place, picture in enumerate(pictures) if picture is not None},
+        "pictures": pictures,
     }  # fmt: skip
 
 
