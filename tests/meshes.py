@@ -5,6 +5,7 @@ Each is a pair: points (N, n), cells (M, n+1).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import permutations, product
 
 import numpy as np
@@ -197,10 +198,14 @@ def split_box(rng, shape, n_nodes, step=0.5):
     return points, oriented(points, np.array([[number[p] for p in cell] for cell in cells]))
 
 
+@lru_cache(10_000)  # most cells are asked for again at the next node
+def _functions(cell):
+    return barycentric_functions(cell)
+
+
 def _split(cell, node):
     """The cells into which a node splits a cell: the cell itself if the node is outside."""
-    functions = barycentric_functions(cell)
-    sides = [dot(gradient, node) + constant for gradient, constant in functions]
+    sides = [dot(gradient, node) + constant for gradient, constant in _functions(tuple(cell))]
     if min(sides) < 0:
         return [cell]
     return [[node if k == i else p for k, p in enumerate(cell)] for i, side in enumerate(sides) if side > 0]

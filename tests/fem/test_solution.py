@@ -45,7 +45,7 @@ def nodes_of_order(mesh, order):
 def uneven(n, seed=3):
     """A mesh of thin cells, turned in space, with the box's faces as sets, and a modulus, ratio and density a cell."""
     rng = np.random.default_rng(seed)
-    points, cells = split_box(rng, (3,) * n, 30, step=0.25)
+    points, cells = split_box(rng, (3,) * n, 14, step=0.25)
     turned = np.eye(n + 1)
     turned[:n, :n], turned[:n, n] = random_rotation(rng, n), rng.uniform(-20.0, 20.0, n)
     image = Image(np.zeros((3,) * n), turned)
