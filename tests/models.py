@@ -35,7 +35,7 @@ def sample_image(n=3):
 @cache
 def ball_mesh(n=3):
     """A ball (a disk) of 40 mm around (30, 30, 30) mm: a lattice of a cube, each shell of it made round."""
-    cube = tetopt.lattice_mesh(tetopt.Image(np.zeros((20,) * n)), blocks=(8,) * n)
+    cube = tetopt.lattice_mesh(tetopt.Image(np.zeros((20,) * n)), blocks=(6,) * n)
     offset = cube.points - cube.points.mean(axis=0)
     length = np.sqrt((offset**2).sum(axis=1, keepdims=True))
     round_ = offset * np.abs(offset).max(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)

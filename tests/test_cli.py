@@ -376,7 +376,7 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
         assert stop()
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(tetopt.job.meshing, "prepare", lambda *_: None)
+    monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", functools.wraps(tetopt.engine.meshing.optimize)(impatient))
     before = signal.getsignal(signal.SIGINT)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
@@ -508,7 +508,7 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
         (tmp_path / "disc.nii").unlink()
         return tetopt.optimize(*arguments, **options)
 
-    monkeypatch.setattr(tetopt.job.meshing, "prepare", lambda *_: None)
+    monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", slow)
     command = ["mesh", tmp_path / "disc.nii", "-o", tmp_path / "a.vtu", "--nodes", "30", "--iterations", "1"]
     assert exit_code(*command) == 0

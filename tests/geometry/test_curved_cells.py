@@ -43,7 +43,7 @@ def test_the_determinant_is_how_the_map_to_the_world_grows(n):
     places = rng.dirichlet(np.ones(n + 1), 20)
     ratios = jacobian_ratios(nodes, cells, places)
     straight, step = np.eye(n + 1) - 1.0 / (n + 1), 1e-5
-    for cell, place in product(range(0, len(cells), 97), range(3)):
+    for cell, place in product(range(0, len(cells), 41), range(3)):
         moved = [places[place] + sign * step * (straight[1:] - straight[0]) for sign in (1.0, -1.0)]
         ahead, behind = (shape_values(each, 2) @ nodes[cells[cell]] for each in moved)
         corners = mesh.points[mesh.cells[cell]]
