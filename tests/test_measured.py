@@ -76,6 +76,7 @@ def test_measuring_needs_its_images(measure, tmp_path, capsys):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.deep
 def test_a_measurement_replaces_its_entry(measure, tmp_path, monkeypatch):
     """A command runs in its folder, and its rows go into the data with version, commit and time."""
     monkeypatch.setattr(measure, "DATA", tmp_path / "measured.json")

@@ -79,7 +79,7 @@ def test_a_violated_requirement_is_told(place):
     assert wrong[0].startswith(str(place / "overlapping.vtu"))
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_a_pool_of_new_processes_works_after_a_run(tmp_path):
     """As the page on processes says; one that forks waits for ever."""
     (tmp_path / "program.py").write_text(

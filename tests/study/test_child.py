@@ -48,15 +48,11 @@ def test_job_arrives_whole():
     assert outcome.notes == ["a note"]
 
 
-@pytest.mark.full
-def test_a_refusal_is_one_line():
-    assert run_in_child(pipes.refuse, JOB, max_seconds=60.0).failure == "thing: expected a, got b; do c"
-
-
 @pytest.mark.deep
 @pytest.mark.parametrize(
     ("pipeline", "line"),
     [
+        (pipes.refuse, "thing: expected a, got b; do c"),
         (pipes.crash, f"twice crashed: signal 11, SIGSEGV; {AFTER_CRASHES}"),
         (pipes.wrap, f"twice mine crashed (signal 11, SIGSEGV); {AFTER_CRASHES}"),
         (pipes.quit_early, "ended with exit code 0 and no message"),
