@@ -55,10 +55,12 @@ def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
     with subprocess.Popen([sys.executable, "-c", code, work], stdout=subprocess.PIPE) as other:
         other.stdout.readline()
         words = rf"^{work}: another run is writing there \(process {other.pid} on .*\); wait until it ends, or stop it$"
-        for keys in (None, ["a"]):
-            with pytest.raises(InputError, match=words), locked(work, keys):
-                pass
-        other.kill()
+        try:
+            for keys in (None, ["a"]):
+                with pytest.raises(InputError, match=words), locked(work, keys):
+                    pass
+        finally:
+            other.kill()
     with locked(work):
         pass
 
