@@ -1,5 +1,7 @@
 """A mesh built within a mask: no voxel outside counts, in any command and in Python, whatever is passed with it."""
 
+import re
+
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
@@ -96,6 +98,8 @@ def test_other_masks_labels_and_images(organ, tmp_path, capsys):
     for function in (tetopt.build_model, tetopt.cell_fields):
         with pytest.warns(UserWarning, match="built within another mask"):
             function(tetopt.load_mesh(organ / "a.vtu").mesh, what)
+    with pytest.warns(UserWarning, match="built within another mask"):
+        tetopt.segment(what, tetopt.load_mesh(organ / "a.vtu").mesh, 2)
     lost = tetopt.load_mesh(organ / "a.vtu")
     tetopt.save_mesh(tmp_path / "lost.vtu", lost.mesh, about={"inputs": lost.text("inputs")})
     capsys.readouterr()
@@ -133,6 +137,49 @@ def test_an_image_in_another_place(organ, tmp_path, capsys):
     words = ["mesh", moved, "--start", mesh, "-o", tmp_path / "b.vtu", "--iterations", "1"]
     assert exit_code(*words) in (0, 1)
     assert "moved.nii.gz: its box was" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_mask_for_a_mesh_of_the_whole_box(organ, tmp_path, capsys):
+    """Its cells are not those of the mask: told, with the Dice of the whole mesh, by commands and in Python."""
+    image, whole = tetopt.load_image(organ / "ct.nii.gz"), tmp_path / "w.vtu"
+    tetopt.save_mesh(whole, tetopt.lattice_mesh(image, nodes=150))
+    corner = np.indices(image.shape).sum(axis=0) < 8
+    tetopt.save_image(tmp_path / "corner.nii.gz", tetopt.Image(1.0 * corner, image.affine))
+    words = ["--image", organ / "ct.nii.gz", "--mask", tmp_path / "corner.nii.gz"]
+    capsys.readouterr()
+    assert exit_code("convert", whole, tmp_path / "c.vtu", *words, "--young", LAW) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert re.search("overlap with a Dice of only 0.0[0-9]+, .* built within another mask", said)
+    assert exit_code("quality", whole, *words, "--check", "--json", tmp_path / "q.json") == 1
+    numbers = numbers_in(tmp_path / "q.json")
+    assert set(numbers["violated"]) == {"mask"}  # and not "box", which is the image's
+    assert f"Dice of only {numbers['mask']['dice']:.3f}" in numbers["violated"]["mask"]
+    assert numbers["fit"]["n_voxels"] == image.data.size
+    what = tetopt.content(image, mask=tetopt.Image(1.0 * corner, image.affine))
+    with pytest.warns(UserWarning, match="within none"):
+        tetopt.build_model(tetopt.load_mesh(whole), what, young=LAW)
+
+
+def test_python_knows_the_place_of_a_mesh_file_s_image(organ):
+    """It warns of an image elsewhere, and refuses one of another dimension by its own name."""
+    image, loaded = tetopt.load_image(organ / "ct.nii.gz"), tetopt.load_mesh(organ / "a.vtu")
+    affine = image.affine.copy()
+    affine[0, 3] += 3.0
+    with pytest.warns(UserWarning, match="image: its box differs"):
+        tetopt.build_model(loaded, tetopt.Image(image.data, affine), young=LAW)
+    with pytest.raises(tetopt.InputError, match="expected a 3-D image like the mesh"):
+        tetopt.build_model(loaded, tetopt.Image(image.data[0]), young=LAW)
+
+
+def test_a_check_without_the_image_judges_angles(tmp_path, capsys):
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
+    words = ["mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", "--nodes", 60, "--iterations", 0]
+    assert exit_code(*words, "--min-dihedral", 60) == 1
+    assert exit_code("quality", tmp_path / "a.vtu", "--check") == 1
+    assert "requirements not met: min_dihedral" in capsys.readouterr().out
+    assert exit_code(*words, "--force") == 0
+    assert exit_code("quality", tmp_path / "a.vtu", "--check") == 0
+    assert "requirements that need no image are met" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["quality", "view"])

@@ -85,7 +85,7 @@ def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
     rows = [label_of(k, volume) for k, volume in ((1, 9.0), (2, 18.5), (5, 2.0), (7, 17.9), (8, 4.6))]
     told(*unmet({}, {"labels": [*rows, label_of(9, 0.0, True)]}))
     (line,) = (line for line in said().splitlines() if "ratio" in line)
-    assert line.startswith("2 labels have more than 2 times the volume")
+    assert line.startswith("2 labels with more than 2 times the volume")
     assert "(ratio in brackets): 5 (0.22), 2 (2.1); allow more nodes" in line
 
 

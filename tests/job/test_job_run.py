@@ -124,7 +124,7 @@ def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, ki
     assert set(numbers) == set(result.numbers)
     stages = [event.data.name for event in events if event.kind == "started"]
     assert stages[0] == "read"
-    assert {"steps" if kind == "parts" else "optimise", "write"} <= set(stages)
+    assert {"round" if kind == "parts" else "optimise", "write"} <= set(stages)
     sentences = {event.data: event.text for event in events if event.kind == "violated"}
     assert sentences == {name: f"requirement violated: {name}: {words}" for name, words in result.violated.items()}
     assert all(event.text for event in events)

@@ -209,10 +209,10 @@ def warnings_once() -> Callable[..., None]:
     return show
 
 
-def print_verdict(violated: Iterable[str], words: str) -> None:
-    """Print the last line of a command: whether the mesh meets all requirements, and the mesh in words."""
+def print_verdict(violated: Iterable[str], words: str, which: str = "all requirements") -> None:
+    """Print the last line of a command: whether the mesh meets the requirements, and the mesh in words."""
     names = ", ".join(violated)
-    print_line(f"requirements not met: {names}; {words}" if names else f"all requirements are met; {words}")
+    print_line(f"requirements not met: {names}; {words}" if names else f"{which} are met; {words}")
 
 
 def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False) -> None:

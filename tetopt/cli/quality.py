@@ -55,7 +55,8 @@ def quality_command(
     wrong = judgement.tell()
     if check:
         whole = f"{nodes_in_words(judgement.loaded.mesh, judgement.loaded.order)}, {size['n_cells']} cells"
-        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}")
+        which = "all requirements" if source is not None else "requirements that need no image"
+        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}", which)
     return int(bool(wrong))
 
 

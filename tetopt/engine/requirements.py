@@ -27,6 +27,10 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
+MASK_WORDS = (
+    "the mesh and the mask overlap with a Dice of only {:.3f}: cells are too large for the mask's detail; allow more "
+    "nodes"
+)
 LABEL_VOXELS = 200  # a label with more voxels must have cells that contain some
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
@@ -159,10 +163,7 @@ def _violated_mask(image: Image, region: Region, result: MeshingResult) -> dict[
         )
     dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
-        violated["mask"] = (
-            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large for the mask's "
-            "detail; allow more nodes"
-        )
+        violated["mask"] = MASK_WORDS.format(dice)
     return violated
 
 

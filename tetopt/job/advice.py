@@ -139,8 +139,8 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     far = [row for row, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
     if far := sorted(far, key=lambda row: -max(ratios[row], 1.0 / ratios[row])):
         worst = ", ".join(f"{words[row.label]} ({ratios[row]:.2g})" for row in far)
-        count = "1 label has" if len(far) == 1 else f"{len(far)} labels have"
-        text = f"{count} more than {VOLUME_RATIO:g} times the volume of their voxels, or less than half"
+        count = "1 label" if len(far) == 1 else f"{len(far)} labels"
+        text = f"{count} with more than {VOLUME_RATIO:g} times the volume of the voxels, or less than half"
         yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
     poor = [row for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE and row not in large]
     if poor:
@@ -189,7 +189,8 @@ def of_result(
         yield Problem(f"{text} raised it", "`retessellate` accept keeps only those that lower it")
     if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
         rise = f"to {last.E_D / first.E_D:.3f} times its initial value" if first.E_D > 0.0 else "from 0"
-        yield Problem(f"E_D rose {rise}, as shapes were improved at its expense", "increase `k_D`")
+        what = "E_D, with voxels on the wrong side of the mask," if "mask" in measured else "E_D"
+        yield Problem(f"{what} rose {rise}, as shapes were improved at its expense", "increase `k_D`")
     if crowded := measured.get("nodes_of_many_labels"):
         text = f"more than {MOST_MEETING} labels meet at {crowded} nodes; only the first {MOST_MEETING} determine"
         yield Problem(f"{text} where these nodes lie")

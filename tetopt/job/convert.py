@@ -17,7 +17,15 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning
-from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
+from tetopt.job.inputs import (
+    check_part,
+    content_within,
+    read_mesh,
+    texts_of,
+    warn_of_other_image,
+    warn_of_other_world,
+    with_labels,
+)
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
@@ -82,6 +90,8 @@ def convert_file(
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
     if image is not None:
         what = content_within(image, part, loaded)
+        if part.labels is not None:
+            warn_of_other_world(image, part.labels)
         if warn_of_other_image(loaded, mesh, image, what.given, is_registered=part.registered):
             about = texts_of(loaded, is_other=True)
         voxels, box = what.image, box_of(what.given) if box is None else box

@@ -39,7 +39,8 @@ from tetopt.io.stacks import parse_spacing
 from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskedPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
-from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask
+from tetopt.measure.requirements import warn_of_other_mask
+from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask, words_of_other_box
 from tetopt.model.labels import NO_TABLE, TABLE_TEXT, label_words, labels_named, labels_of, table_words
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
@@ -125,7 +126,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Originals | None = Non
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
         original = originals.get((other, aligned)) or read_companion(other, part.spacing_mm)
-        _warn_of_other_world(path, other)
+        warn_of_other_world(path, other)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
         moved = aligned(original, grid, str(other))
@@ -141,7 +142,7 @@ def image_and_others(path: Path, part: ImagePart, finest: Originals | None = Non
     return Aligned(image, beside, factors)
 
 
-def _warn_of_other_world(path: Path, other: Path) -> None:
+def warn_of_other_world(path: Path, other: Path) -> None:
     """Warn of two DICOM files whose positions are in different frames of reference."""
     one = frame_of_reference(file_and_volume(other)[0])
     two = None if one is None else frame_of_reference(path)
@@ -293,6 +294,14 @@ def mask_for(
     return mask
 
 
+def _mask_of_mesh(options: MaskedPart, image: Image, beside: Callable[..., Image], loaded: MeshFile) -> Image | None:
+    """Do the same as `mask_for`; warn of a mask that the mesh hardly overlaps with, if its file contains none."""
+    mask = mask_for(options, image, beside, loaded)
+    if options.mask is not None and MASK_TEXT not in loaded.field_data:
+        warn_of_other_mask(loaded.mesh, mask)
+    return mask
+
+
 def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
     """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`; none without one.
 
@@ -347,7 +356,7 @@ def content_within(path: Path, part: MaskedPart, loaded: MeshFile) -> Content:
     whole, beside, _ = image_and_others(path, part, read_mask(part))
     if whole.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
-    mask = mask_for(part, whole, beside, loaded)
+    mask = _mask_of_mesh(part, whole, beside, loaded)
     beyond = None if mask is None else continuation(mask, whole.spacing)
     return Content(continued(whole, beyond), continuation=beyond, whole=whole)
 
@@ -364,7 +373,7 @@ def with_labels(loaded: MeshFile, path: Path | None, options: LabelledPart) -> M
         return aligned(read_mask(options)[other, aligned], labels, str(other))
 
     try:
-        counted = continued(labels, mask_for(options, labels, beside, loaded))
+        counted = continued(labels, _mask_of_mesh(options, labels, beside, loaded))
         fields = {**loaded.cell_data, "label": cell_labels(counted, loaded.mesh)}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -434,10 +443,10 @@ def warn_of_other_image(
     Reject such an image unless it is registered or has the source's box to a voxel; with `is_exact`, reject any image
     with another box.
     """
-    made_from, box, words = loaded.text("image_sha256"), loaded.box, ""
+    made_from, words = loaded.text("image_sha256"), ""
     is_other = made_from is not None and made_from != sha256(image_path)
-    if (is_exact or is_other) and box is not None and len(box.shape) == image.ndim:
-        words = other_box(box, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)
+    if is_exact or is_other:
+        words = words_of_other_box(loaded, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)
     if words and (is_exact or not is_registered):
         remedy = "if it is registered to that image of the same subject, pass `registered`"
         remedy = "`check` needs that image, with its crop" if is_exact else remedy

@@ -11,6 +11,7 @@ import numpy as np
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
+from tetopt.engine.requirements import ANGLE_ROUNDING, MASK_DICE, MASK_WORDS
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
@@ -100,6 +101,10 @@ class Judgement(NamedTuple):
             if not self.is_checked:  # only what makes the numbers meaningless
                 requirements, measured = {name: words for name, words in requirements.items() if name == "mask"}, {}
             problems += unmet(requirements, measured, self.mask_word)
+        least, smallest = self.requirements["min_dihedral"], self.shape.min_dihedral
+        if self.is_checked and self.source is None and least and smallest < least - ANGLE_ROUNDING:
+            text = f"{self.path}: the smallest dihedral angle is {smallest:.2f} degrees, below {least:g}"
+            problems.append(Problem(text, name="min_dihedral"))
         return agreed([*problems, *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", []))])
 
 
@@ -180,16 +185,20 @@ def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[in
 
 def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
     """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to mask and labels."""
-    source, mesh, of_cell = (
-        cast(Source, judgement.source),
-        judgement.loaded.mesh,
-        judgement.loaded.cell_data.get("label"),
-    )
+    source, loaded = cast(Source, judgement.source), judgement.loaded
+    mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
     fit = image_fit(source.image, mesh)
     result = judged(mesh, source.content, of_cell, **judgement.requirements)
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
+    if source.mask is not None:  # the content has the voxels around the mask alone
+        whole = image_fit(source.contrasts[0], mesh)
+        fit = fit._replace(n_voxels=whole.n_voxels, n_empty_cells=whole.n_empty_cells, overlap=whole.overlap)
+        violated = {name: words for name, words in result.violated.items() if name != "mask"}
+        if (dice := measured["mask"].dice) < MASK_DICE:
+            violated["mask"] = MASK_WORDS.format(dice)
+        result = result._replace(violated=violated)
     if not judgement.is_compared:
         measured.pop("mask", None)
     if not source.content.is_plain:

@@ -14,7 +14,15 @@ from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning
-from tetopt.job.inputs import check_part, content_within, read_mesh, texts_of, warn_of_other_image, with_labels
+from tetopt.job.inputs import (
+    check_part,
+    content_within,
+    read_mesh,
+    texts_of,
+    warn_of_other_image,
+    warn_of_other_world,
+    with_labels,
+)
 from tetopt.job.model import (
     check_model_options,
     large_words,
@@ -138,6 +146,8 @@ def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPa
     about, box, whole, voxels = texts_of(loaded), loaded.box, None, None
     if image is not None:
         what = content_within(image, part, loaded)
+        if part.labels is not None:
+            warn_of_other_world(image, part.labels)
         whole, voxels = what.given, what.image
         is_other = warn_of_other_image(loaded, path, image, whole, is_registered=part.registered)
         about = texts_of(loaded, is_other=is_other)

@@ -6,9 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.energy.discretization import content_E_D
+from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.requirements import checked, requested, violated_box
+from tetopt.engine.requirements import MASK_DICE, checked, requested, violated_box
+from tetopt.errors import warn
+from tetopt.geometry.simplex import volumes
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 
@@ -51,5 +56,20 @@ def judged(
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
     result = checked(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
     result = requested(result, content, target_error, is_filled)
-    beyond = violated_box(mesh, content.image) if is_filled or content.region is not None else {}
+    beyond = violated_box(mesh, content.given) if is_filled or content.region is not None else {}
     return result._replace(violated={**result.violated, **beyond})
+
+
+def warn_of_other_mask(mesh: Mesh, mask: Image | None) -> None:
+    """Warn if a mesh hardly overlaps with a mask: cells elsewhere take the values of its nearest voxels."""
+    if mask is None:
+        return
+    inside = mask.data >= INSIDE_FRACTION
+    n_both = int((inside & (cell_of_voxel(mask, mesh) >= 0)).sum())
+    n_covered = float(volumes(mesh.points, mesh.cells).sum()) / mask.voxel_volume
+    dice = 2.0 * n_both / (n_covered + int(inside.sum()))
+    if dice < MASK_DICE:
+        warn(
+            f"mesh and mask overlap with a Dice of only {dice:.2g}, and cells elsewhere take values of the mask's "
+            "nearest voxels; was the mesh built within another mask, or within none?"
+        )

@@ -15,6 +15,7 @@ from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.mesh import Mesh
 
 
@@ -48,6 +49,8 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     >>> int((labels.data != truth.data).sum())  # voxels that differ from the phantom
     20
     """
+    if isinstance(image, Content):
+        warn_of_other_mask(mesh, image.own_mask)
     moments = cell_moments(own_image(image), mesh)
     if not moments.n_voxels.any():
         raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")

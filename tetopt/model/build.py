@@ -13,9 +13,10 @@ from tetopt.contents.domain import mask_text
 from tetopt.errors import InputError, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
+from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
-from tetopt.model.fields import cell_fields, warn_of_other_mask
+from tetopt.model.fields import cell_fields
 from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
@@ -28,6 +29,7 @@ from tetopt.model.file import (
     own_mask,
     sets_beside,
     without_results,
+    words_of_other_box,
 )
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, labels_of, table_of_words, table_words
 from tetopt.model.loads import parse_load, parse_loads
@@ -184,12 +186,14 @@ def _voxels(
 ) -> tuple[Image | None, Image | None, dict[str, Any]]:
     """Return the image with the voxels that count, the whole image, and the file's strings with one on the mask."""
     if isinstance(image, Content) and (mask := image.own_mask) is not None:
-        if isinstance(mesh, Mesh):
-            warn_of_other_mask(mesh, image)
+        if isinstance(mesh, Mesh) or MASK_TEXT not in mesh.field_data:
+            warn_of_other_mask(mesh if isinstance(mesh, Mesh) else mesh.mesh, mask)
         elif n_other := count_of_other_voxels(mesh, mask):
             warn(f"image: the content's mask differs in {n_other} voxels from the mask that the mesh was built within")
         return image.own, image.given, {MASK_TEXT: mask_text(mask), **about}
     image = image.own if isinstance(image, Content) else image
+    if image is not None and isinstance(mesh, MeshFile) and (words := words_of_other_box(mesh, image)):
+        warn(f"image: its box differs from that of the mesh's image, {words}; is it registered to that image?")
     within = None if image is None or isinstance(mesh, Mesh) else own_mask(mesh, image)
     return (image if image is None else continued(image, within)), image, about
 

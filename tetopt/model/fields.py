@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, own_image
-from tetopt.energy.sampling import cell_moments_and_ranges, cell_of_voxel
-from tetopt.errors import InputError, warn
+from tetopt.energy.sampling import cell_moments_and_ranges
+from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import dihedral_angles, rho, volumes
 from tetopt.image import Image
+from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.mesh import Mesh
 
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2 may follow.
@@ -21,7 +22,6 @@ TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
 NODE_MODULI = "young_nodes"  # point data in tetopt's files: moduli that are linear within cells
 GAUSS_MODULI = "young_gauss"  # cell data in tetopt's files: moduli at Gauss points of quadratic cells, one per column
 STRESS_FIELDS = ("young", NODE_MODULI, GAUSS_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
-OTHER_MASK_DICE = 0.9  # of a mesh with a content's mask: below it, the mesh was probably built within another mask
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
@@ -63,7 +63,7 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
     """
     fields: dict[str, NDArray] = {}
     if isinstance(image, Content):
-        warn_of_other_mask(mesh, image)
+        warn_of_other_mask(mesh, image.own_mask)
     if image is not None:
         moments, (low, high) = cell_moments_and_ranges(own_image(image), mesh)
         fields |= {"mean": moments.mean, "variance": moments.variance, "n_voxels": moments.n_voxels}
@@ -72,21 +72,6 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
     fields["rho"] = rho(mesh.points, mesh.cells)
     fields["min_dihedral"] = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     return fields
-
-
-def warn_of_other_mask(mesh: Mesh, what: Content) -> None:
-    """Warn if a mesh hardly overlaps with a content's mask: cells elsewhere take the values of its nearest voxels."""
-    mask = what.own_mask
-    if mask is None:
-        return
-    n_both = int((mask.data.astype(bool) & (cell_of_voxel(mask, mesh) >= 0)).sum())
-    n_covered = float(volumes(mesh.points, mesh.cells).sum()) / mask.voxel_volume
-    dice = 2.0 * n_both / (n_covered + float(mask.data.sum()))
-    if dice < OTHER_MASK_DICE:
-        warn(
-            f"mesh: overlaps with the content's mask with a Dice of only {dice:.2g}, and cells elsewhere take values "
-            "of the mask's nearest voxels; was the mesh built within another mask?"
-        )
 
 
 def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:

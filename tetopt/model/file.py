@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import resample_mask
+from tetopt.contents.align import SAME_BOX_VOXELS, other_box, resample_mask
 from tetopt.contents.domain import INSIDE_FRACTION, mask_of
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -155,6 +155,12 @@ def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
+def words_of_other_box(loaded: MeshFile, image: Image, tolerance: float = SAME_BOX_VOXELS) -> str:
+    """Return `tetopt.contents.align.other_box` of the box in a mesh's file; "" if it has none."""
+    box = loaded.box
+    return "" if box is None or len(box.shape) != image.ndim else other_box(box, image, tolerance)
+
+
 def count_of_other_voxels(loaded: MeshFile, mask: Image) -> int:
     """Return the number of voxels in which a mask differs from the one in a mesh's file; 0 if it contains none."""
     own = own_mask(loaded, mask) if MASK_TEXT in loaded.field_data else None
@@ -169,8 +175,11 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
     Raises
     ------
     InputError
-        The file names a mask but does not contain it; the mask lies outside the image.
+        The image's dimension differs from the mesh's; the file names a mask but does not contain it; the mask lies
+        outside the image.
     """
+    if image.ndim != loaded.mesh.ndim:
+        raise InputError(f"image: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
     if MASK_TEXT in loaded.field_data:
         mask = None
         with suppress(ValueError, TypeError, KeyError, OverflowError):  # another program's "mask"
