@@ -455,7 +455,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("quality no.vtu", "no such file"),
         ("quality {disc}", "expected a .vtu, .vtk, .msh or .msh2 mesh"),
         ("quality {lattice} --image no.nii", "no such file"),
-        ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
+        ("quality {lattice} --image {disc}", "a 3-D image like the mesh, got a 2-D one"),
         ("quality", r"Missing argument '\[IMAGE\] MESH'"),
         ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
         ("phantom no.toml -o a.nii", "no.toml"),

@@ -408,7 +408,7 @@ def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path,
         assert exit_code(*words, "--registered") == 0
         said = capsys.readouterr().err
         assert "a.vtu was built from a different image" in said
-        assert "% of the nodes lie outside the image: cells there take the nearest voxel's value" in said
+        assert "% of the nodes lie outside the image or its mask: cells there take the nearest voxel's value" in said
     assert exit_code(*convert, tmp_path / "far.nii", "--registered") == 2
     assert "no node lies in the image's box" in capsys.readouterr().err
 

@@ -250,8 +250,8 @@ def model_of_file(
     if image is not None and (outside := float((beyond_box(mesh, image) > 1.0).mean())) > 0.0:
         if outside == 1.0:
             raise InputError("mesh and image: no node lies in the image's box; do both use the same world coordinates?")
-        words = f"{outside:.1%} of the nodes lie outside the image or its mask"
-        warning(f"{words}: cells there take the nearest voxel's value")
+        of_nodes = f"{outside:.1%} of the nodes lie outside the image or its mask"
+        warning(f"{of_nodes}: cells there take the nearest voxel's value")
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
     sets = all_sets(mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
