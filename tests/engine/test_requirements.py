@@ -196,3 +196,15 @@ def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
     start = tetopt.mesh_image(image, 60, iterations=1).mesh
     kept = tetopt.mesh_image(image, start=start, iterations=1, min_dihedral=65.0)
     assert list(kept.violated) == ["min_dihedral"]
+
+
+def test_the_boundary_of_the_user_s_mesh_is_judged():
+    """Two blocks that meet in an edge alone, as in a mesh that lost cells; the check of its file says the same."""
+    image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    lattice = tetopt.lattice_mesh(image, nodes=400)
+    at = lattice.points[lattice.cells].mean(axis=1) - lattice.points.mean(axis=0)
+    kept = lattice.cells[at[:, 0] * at[:, 1] > 0.0]
+    nodes, cells = np.unique(kept, return_inverse=True)
+    halves = tetopt.Mesh(lattice.points[nodes], cells.reshape(-1, 4))
+    assert "manifold" in tetopt.mesh_image(image, start=halves, iterations=1).violated
+    assert "manifold" not in tetopt.mesh_image(image, start=lattice, iterations=1).violated

@@ -117,7 +117,7 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
     """Add requests to `mesh_image` that a run's result does not meet to its violated requirements.
 
     `error`: an unexplained variance above `target_error`. `cover`: uncovered voxels or volume, if the mesh should fill
-    the image's box (`is_filled`).
+    the image's box (`is_filled`). `manifold`: edges or nodes at which the boundary of the user's own mesh is none.
     """
     violated = dict(result.violated)
     fraction = unexplained_by(content, result.mesh, result.history[-1])
@@ -127,6 +127,8 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
             "cells or more iterations, or give a number of nodes"
         )
     violated |= _uncovered(content.image, result) if is_filled else {}
+    if not is_filled and content.region is None and (problems := manifold_problems(result.mesh)):
+        violated["manifold"] = "; ".join([*problems, "mend the initial mesh"])
     return result._replace(violated=violated, fraction=fraction)
 
 
