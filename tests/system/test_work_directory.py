@@ -101,3 +101,16 @@ def test_what_is_removed_is_tetopts(work, monkeypatch):
     (work / "mesh-4.npz").rmdir()
     assert discard(work, NAMES) == []
     assert not work.exists()
+
+
+def test_a_lock_that_is_a_link_empties_no_file(work, tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("of the user")
+    for name, keys in (("tetopt-lock", None), ("a.lock", ["a"])):
+        (work / name).unlink(missing_ok=True)
+        (work / name).symlink_to(mine)
+        with pytest.raises(InputError, match=f"{name}: expected a regular file, got a link"), locked(work, keys):
+            pass
+        assert mine.read_text() == "of the user"
+        (work / name).unlink()
+        (work / "tetopt-lock").touch()

@@ -59,6 +59,8 @@ def locked(path: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
 
 def _lock(stack: ExitStack, path: Path, what: str, *, is_shared: bool) -> None:
     """Lock a file until the stack is unwound; it names the run, unless others share the lock."""
+    if path.is_symlink():  # another file would be emptied
+        raise InputError(f"{path}: expected a regular file, got a link; move it away and run this again")
     if not HAS_LOCKS:
         return
     stream = stack.enter_context(path.open("a+", encoding="utf-8", errors="replace"))
