@@ -163,7 +163,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: $(VENV)/bin/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[demo]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e . "nilearn>=0.10.4"
 	@touch $@
 
 $(VENV)/.test: $(VENV)/bin/python pyproject.toml
