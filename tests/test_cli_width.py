@@ -9,6 +9,7 @@ import tetopt
 import tetopt.cli.console as console
 from tetopt.measure.fidelity import LabelFidelity, Thickness
 from tetopt.measure.interfaces import LabelInterface
+from tetopt.report.tables import worst_labels
 
 N_LABELS = 300
 
@@ -47,7 +48,15 @@ def test_tables_of_hundreds_of_labels(labels, capsys, every):
     else:
         assert len(shown) == 12
         assert shown[-1].startswith(f"{100000 + N_LABELS - 1} left")  # the worst
-        assert any("12 of 300 labels with the lowest Dice" in line for line in lines)
+        assert any("12 of 300 labels that fit worst, by Dice or volume" in line for line in lines)
+
+
+def test_a_label_of_another_volume_is_among_the_worst(labels):
+    """Its Dice by voxels may be 1: its one voxel lies in its one cell, of a tenth of the voxel's volume."""
+    rows = labels["labels"]
+    rows[3] = rows[3]._replace(mesh_volume=0.1 * rows[3].volume)
+    assert 3 in worst_labels(rows)
+    assert len(worst_labels(rows)) == 12
 
 
 @pytest.fixture(scope="module")

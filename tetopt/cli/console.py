@@ -244,7 +244,8 @@ def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
     rows, interfaces = ([measured[name][place] for place in places] for name in ("labels", "interfaces"))
     print_table(label_table(rows, names, ndim))
     if len(places) < n_labels:
-        print_line(f"the {len(places)} of {n_labels} labels with the lowest Dice; `tetopt quality --all` prints all")
+        which = f"the {len(places)} of {n_labels} labels that fit worst, by Dice or volume"
+        print_line(f"{which}; `tetopt quality --all` prints all")
     if every:
         print_table(surface_table(rows, interfaces, names))
     for line in label_differences(rows, interfaces, names):

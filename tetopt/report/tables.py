@@ -136,11 +136,16 @@ def curving_in_words(curving: Curving) -> str:
 
 
 def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS) -> list[int]:
-    """Return the places of at most `most` labels, by default 12: those with the lowest Dice if there are more."""
+    """Return the places of at most `most` labels, by default 12: the worst by Dice or volume if there are more."""
     places = list(range(len(rows)))
     if most is None or len(rows) <= most:
         return places
-    return sorted(sorted(places, key=lambda place: rows[place].dice)[:most])
+
+    def fit(place: int) -> float:
+        volume, voxels = rows[place].mesh_volume, rows[place].volume
+        return min(rows[place].dice, min(volume, voxels) / max(volume, voxels))
+
+    return sorted(sorted(places, key=fit)[:most])
 
 
 def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: int) -> Table:
