@@ -8,6 +8,7 @@ from commands import exit_code, numbers_in
 from scipy.ndimage import gaussian_filter
 
 import tetopt
+import tetopt.job.run
 import tetopt.measure.measures
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
