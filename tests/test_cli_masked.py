@@ -126,12 +126,18 @@ def test_an_image_in_another_place(organ, tmp_path, capsys):
     affine[0, 3] += 3.0 * image.spacing[0]
     moved, mesh = tmp_path / "moved.nii.gz", organ / "a.vtu"
     tetopt.save_image(moved, tetopt.Image(image.data, affine))
+    affine[0, 3] += 300.0
+    far = tmp_path / "far.nii.gz"
+    tetopt.save_image(far, tetopt.Image(image.data, affine))
     for words in (
         ["quality", mesh], ["segment", mesh, "-o", tmp_path / "s.nii"], ["view", mesh, "--html", tmp_path / "v.html"],
         ["convert", mesh, tmp_path / "c.vtu"], ["fem", mesh],
     ):  # fmt: skip
         assert exit_code(*words, "--image", moved) == 2
         assert "moved.nii.gz: expected the box of" in capsys.readouterr().err
+        if words[0] != "quality":
+            assert exit_code(*words, "--image", far, "--mask", organ / "m.nii.gz") == 2  # before it reads the mask
+            assert "far.nii.gz: expected the box of" in capsys.readouterr().err
     assert exit_code("quality", mesh, "--image", moved, "--registered") == 0
     assert "was built from a different image, not" in capsys.readouterr().err
     words = ["mesh", moved, "--start", mesh, "-o", tmp_path / "b.vtu", "--iterations", "1"]
@@ -150,6 +156,9 @@ def test_a_mask_for_a_mesh_of_the_whole_box(organ, tmp_path, capsys):
     assert exit_code("convert", whole, tmp_path / "c.vtu", *words, "--young", LAW) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert re.search("overlap with a Dice of only 0.0[0-9]+, .* built within another mask", said)
+    for more in (words, words[2:]):  # on the voxels of image and labels, or of labels alone
+        assert exit_code("convert", whole, tmp_path / "d.vtu", *more, "--labels", organ / "l.nii.gz", "--force") == 0
+        assert capsys.readouterr().err.count("overlap with a Dice") == 1
     assert exit_code("quality", whole, *words, "--check", "--json", tmp_path / "q.json") == 1
     numbers = numbers_in(tmp_path / "q.json")
     assert set(numbers["violated"]) == {"mask"}  # and not "box", which is the image's
@@ -165,8 +174,11 @@ def test_python_knows_the_place_of_a_mesh_file_s_image(organ):
     image, loaded = tetopt.load_image(organ / "ct.nii.gz"), tetopt.load_mesh(organ / "a.vtu")
     affine = image.affine.copy()
     affine[0, 3] += 3.0
-    with pytest.warns(UserWarning, match="image: its box differs"):
-        tetopt.build_model(loaded, tetopt.Image(image.data, affine), young=LAW)
+    moved = tetopt.Image(image.data, affine)
+    mask = tetopt.Image(tetopt.load_image(organ / "m.nii.gz").data, affine)
+    for what in (moved, tetopt.content(moved, mask=mask)):
+        with pytest.warns(UserWarning, match="image: its box differs"):
+            tetopt.build_model(loaded, what, young=LAW)
     with pytest.raises(tetopt.InputError, match="expected a 3-D image like the mesh"):
         tetopt.build_model(loaded, tetopt.Image(image.data[0]), young=LAW)
 

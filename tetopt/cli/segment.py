@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from tetopt import Content, InputError, Mesh, save_image
 from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.energy.sampling import overlap_of
-from tetopt.job.inputs import content_within, read_labels, read_mesh, warn_of_other_image
+from tetopt.job.inputs import read_labels, read_mesh, voxels_of
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.files import checked_output
@@ -40,10 +40,9 @@ def segment_command(
     if image_path is None:
         raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
     loaded = read_mesh(mesh_path)
-    what = content_within(image_path, part, loaded)
+    what = cast(Content, voxels_of(loaded, mesh_path, image_path, part).content)
     image, mesh = what.given, loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
-    warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=part.registered)
     inside = _voxels_in(mesh, what, mesh_path, image_path)
     labels = segment(what, mesh, classes)
     of_class, h = labels.data[inside].astype(np.int64), image.data[inside]

@@ -15,7 +15,7 @@ import numpy as np
 from tetopt import InputError
 from tetopt.cli.console import print_line
 from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
-from tetopt.job.inputs import check_part, content_within, label_table, number_of, read_mesh, warn_of_other_image
+from tetopt.job.inputs import check_part, label_table, number_of, read_mesh, voxels_of
 from tetopt.job.options import BoxPart, MaskedPart, MaskPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
@@ -46,13 +46,10 @@ def view_command(
     check_part(image_path, counted)
     loaded = read_mesh(mesh_path)
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
-    image = None
-    if image_path is not None:
-        what = content_within(image_path, counted, loaded)
-        image = what.given
-        warn_of_other_image(loaded, mesh_path, image_path, image, is_registered=counted.registered)
-        if "mean" not in fields:
-            fields = cell_fields(mesh, what) | fields
+    what = voxels_of(loaded, mesh_path, image_path, counted).content
+    image = None if what is None else what.given
+    if what is not None and "mean" not in fields:
+        fields = cell_fields(mesh, what) | fields
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}

@@ -17,15 +17,7 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning
-from tetopt.job.inputs import (
-    check_part,
-    content_within,
-    read_mesh,
-    texts_of,
-    warn_of_other_image,
-    warn_of_other_world,
-    with_labels,
-)
+from tetopt.job.inputs import check_part, read_mesh, texts_of, voxels_of
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
@@ -79,7 +71,6 @@ def convert_file(
     check_part(image, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
-    loaded = with_labels(loaded, part.labels, part)
     loaded = without_stale_results(loaded, solver) if results is None else _with_results(loaded, results)
     solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
@@ -87,15 +78,12 @@ def convert_file(
         raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
     if not solver.loads and not is_surface:
         solver = replace(solver, loads=loads_of(loaded))
+    loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
-    if image is not None:
-        what = content_within(image, part, loaded)
-        if part.labels is not None:
-            warn_of_other_world(image, part.labels)
-        if warn_of_other_image(loaded, mesh, image, what.given, is_registered=part.registered):
-            about = texts_of(loaded, is_other=True)
-        voxels, box = what.image, box_of(what.given) if box is None else box
+    if image is not None and what is not None:
+        about = texts_of(loaded, is_other=True) if is_other else about
         about |= {"image": image.name, "image_sha256": sha256(image)}
+        voxels, box = what.image, box_of(what.given) if box is None else box
     if box is not None:
         about["box"] = box_text(box)
     if is_surface:  # a surface has no materials

@@ -37,7 +37,7 @@ from tetopt.io.meshes import load_mesh
 from tetopt.io.read_dicom import frame_of_reference
 from tetopt.io.stacks import parse_spacing
 from tetopt.job.events import note, warning
-from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, LabelledPart, MaskedPart, SourceOptions, stated_part
+from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, MaskedPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask, words_of_other_box
@@ -105,14 +105,12 @@ class Aligned(NamedTuple):
     factors: tuple[int, ...]  # parts of the file's voxels along each axis
 
 
-def image_and_others(path: Path, part: ImagePart, finest: Originals | None = None) -> Aligned:
-    """Read the selected part of an image, on voxels divided to the size of the `finest` of labels and mask."""
-    image = read_image(path, part)
+def image_and_others(image: Image, path: Path, part: ImagePart, originals: Originals) -> Aligned:
+    """Divide the voxels of an image, the selected part of its file, to the size of the finest of labels and mask."""
     # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
     slice_ = None if part.slice_ is None else parse_slice(part.slice_)
     whole = coarse = image if slice_ is None else read_image(path, replace(part, slice_=None, crop=None))
     crop = None if part.crop is None else parse_crop(part.crop)
-    originals = finest or {}
     finer = {other: each for (other, _), each in originals.items()}
     factors = _divisions(whole, finer, None if slice_ is None else slice_[0])
     if max(factors) > 1:
@@ -294,14 +292,6 @@ def mask_for(
     return mask
 
 
-def _mask_of_mesh(options: MaskedPart, image: Image, beside: Callable[..., Image], loaded: MeshFile) -> Image | None:
-    """Do the same as `mask_for`; warn of a mask that the mesh hardly overlaps with, if its file contains none."""
-    mask = mask_for(options, image, beside, loaded)
-    if options.mask is not None and MASK_TEXT not in loaded.field_data:
-        warn_of_other_mask(loaded.mesh, mask)
-    return mask
-
-
 def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
     """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`; none without one.
 
@@ -345,41 +335,68 @@ def check_part(image: Path | None, part: MaskedPart, labels: Path | None = None)
         raise InputError(f"`{lost[0]}`: needs `image`")
 
 
-def content_within(path: Path, part: MaskedPart, loaded: MeshFile) -> Content:
-    """Read the image of a mesh's file: `whole`, and as `image` continued beyond the mask of the voxels that count.
+class MeshVoxels(NamedTuple):
+    """A mesh's file, and the voxels beside it that count."""
+
+    loaded: MeshFile  # with the labels of an image's voxels, if requested
+    content: Content | None  # of the image, if there is one
+    is_other: bool  # True if the mesh's file names another image
+
+
+def voxels_of(
+    loaded: MeshFile, mesh: Path, image: Path | None, part: MaskedPart, labels: Path | None = None
+) -> MeshVoxels:
+    """Read the image and the labels beside a mesh's file, without the voxels outside its mask.
+
+    The image's box is checked before the mask is read. The mesh gets the majority labels of the voxels in its cells.
 
     Raises
     ------
     InputError
-        As for `mask_for`; the image's dimension differs from the mesh's.
+        As for `mask_for` and `warn_of_other_image`; the dimension of the image or the labels differs from the mesh's.
     """
-    whole, beside, _ = image_and_others(path, part, read_mask(part))
-    if whole.ndim != loaded.mesh.ndim:
-        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
-    mask = _mask_of_mesh(part, whole, beside, loaded)
-    beyond = None if mask is None else continuation(mask, whole.spacing)
-    return Content(continued(whole, beyond), continuation=beyond, whole=whole)
+    content, of_labels, is_other = None, None, False
+    if image is not None:
+        whole = read_image(image, part)
+        if whole.ndim != loaded.mesh.ndim:
+            raise InputError(f"{image}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
+        is_other = warn_of_other_image(loaded, mesh, image, whole, is_registered=part.registered)
+        whole, beside, _ = image_and_others(whole, image, part, read_mask(part))
+        content = _within(whole, part, beside, loaded)
+    if labels is not None:
+        if image is not None:
+            warn_of_other_world(image, labels)
+        loaded, of_labels = _with_labels(loaded, labels, part)
+    counted = of_labels if content is None else content
+    if counted is not None and part.mask is not None and MASK_TEXT not in loaded.field_data:
+        warn_of_other_mask(loaded.mesh, counted.own_mask)
+    return MeshVoxels(loaded, content, is_other)
 
 
-def with_labels(loaded: MeshFile, path: Path | None, options: LabelledPart) -> MeshFile:
-    """Return the mesh with the majority labels of an image's voxels on its cells, instead of the file's labels."""
-    if path is None:
-        return loaded
-    labels = checked_labels(str(path), read_companion(path, options.spacing_mm), is_map=True)
+def _within(image: Image, part: MaskedPart, beside: Callable[..., Image], loaded: MeshFile) -> Content:
+    """Return an image as given, and continued beyond the mask of the voxels that count for a mesh's file."""
+    mask = mask_for(part, image, beside, loaded)
+    beyond = None if mask is None else continuation(mask, image.spacing)
+    return Content(continued(image, beyond), continuation=beyond, whole=image)
+
+
+def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart) -> tuple[MeshFile, Content]:
+    """Return the mesh with the majority labels of an image's voxels, instead of the file's, and these voxels."""
+    labels = checked_labels(str(path), read_companion(path, part.spacing_mm), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 
-    def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        return aligned(read_mask(options)[other, aligned], labels, str(other))
+    def beside(other: Path, aligned: Align) -> Image:
+        return aligned(read_mask(part)[other, aligned], labels, str(other))
 
     try:
-        counted = continued(labels, _mask_of_mesh(options, labels, beside, loaded))
-        fields = {**loaded.cell_data, "label": cell_labels(counted, loaded.mesh)}
+        counted = _within(labels, part, beside, loaded)
+        fields = {**loaded.cell_data, "label": cell_labels(counted.image, loaded.mesh)}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)
     texts = {TABLE_TEXT: np.array([table_words(own)])} if own.names else {}
-    return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts})
+    return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts}), counted
 
 
 def table_of_segmentation(path: Path | None) -> LabelTable:

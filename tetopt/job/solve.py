@@ -14,22 +14,8 @@ from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning
-from tetopt.job.inputs import (
-    check_part,
-    content_within,
-    read_mesh,
-    texts_of,
-    warn_of_other_image,
-    warn_of_other_world,
-    with_labels,
-)
-from tetopt.job.model import (
-    check_model_options,
-    large_words,
-    loads_of,
-    model_of_file,
-    with_chosen_sets,
-)
+from tetopt.job.inputs import check_part, read_mesh, texts_of, voxels_of
+from tetopt.job.model import check_model_options, large_words, loads_of, model_of_file, with_chosen_sets
 from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.file import MeshFile, without_results
@@ -142,15 +128,10 @@ def _check_box(image: Image, loaded: MeshFile) -> None:
 
 def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPart, compress: float | None) -> Model:
     """Build the model to solve, of the mesh's file and the image."""
-    loaded = with_labels(without_results(read_mesh(path)), part.labels, part)
-    about, box, whole, voxels = texts_of(loaded), loaded.box, None, None
-    if image is not None:
-        what = content_within(image, part, loaded)
-        if part.labels is not None:
-            warn_of_other_world(image, part.labels)
+    loaded, what, is_other = voxels_of(without_results(read_mesh(path)), path, image, part, part.labels)
+    about, box, whole, voxels = texts_of(loaded, is_other=is_other), loaded.box, None, None
+    if what is not None:
         whole, voxels = what.given, what.image
-        is_other = warn_of_other_image(loaded, path, image, whole, is_registered=part.registered)
-        about = texts_of(loaded, is_other=is_other)
         if not model.loads:
             _check_box(whole, loaded)
         box = box_of(whole)

@@ -35,6 +35,7 @@ from tetopt.job.inputs import (
     mask_for,
     number_of,
     read_companion,
+    read_image,
     read_mask,
     tissue_files,
     tissue_volumes,
@@ -127,7 +128,7 @@ def read_source(
     finest: Originals = read_mask(options, label_names)
     if options.labels is not None:
         finest = {**finest, (options.labels, resample_labels): read_companion(options.labels, options.spacing_mm)}
-    image, beside, factors = image_and_others(paths[0], options, finest)
+    image, beside, factors = image_and_others(read_image(paths[0], options), paths[0], options, finest)
     labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
     if labels is not None and is_own and numbers:
         image = labels

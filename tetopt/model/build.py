@@ -185,17 +185,17 @@ def _voxels(
     image: Image | Content | None, mesh: Mesh | MeshFile, about: dict[str, Any]
 ) -> tuple[Image | None, Image | None, dict[str, Any]]:
     """Return the image with the voxels that count, the whole image, and the file's strings with one on the mask."""
+    whole = image.given if isinstance(image, Content) else image
+    if whole is not None and isinstance(mesh, MeshFile) and (words := words_of_other_box(mesh, whole)):
+        warn(f"image: its box differs from that of the mesh's image, {words}; is it registered to that image?")
     if isinstance(image, Content) and (mask := image.own_mask) is not None:
         if isinstance(mesh, Mesh) or MASK_TEXT not in mesh.field_data:
             warn_of_other_mask(mesh if isinstance(mesh, Mesh) else mesh.mesh, mask)
         elif n_other := count_of_other_voxels(mesh, mask):
             warn(f"image: the content's mask differs in {n_other} voxels from the mask that the mesh was built within")
-        return image.own, image.given, {MASK_TEXT: mask_text(mask), **about}
-    image = image.own if isinstance(image, Content) else image
-    if image is not None and isinstance(mesh, MeshFile) and (words := words_of_other_box(mesh, image)):
-        warn(f"image: its box differs from that of the mesh's image, {words}; is it registered to that image?")
-    within = None if image is None or isinstance(mesh, Mesh) else own_mask(mesh, image)
-    return (image if image is None else continued(image, within)), image, about
+        return image.own, whole, {MASK_TEXT: mask_text(mask), **about}
+    within = None if whole is None or isinstance(mesh, Mesh) else own_mask(mesh, whole)
+    return (whole if whole is None else continued(whole, within)), whole, about
 
 
 def _said(answer: tuple[Any, str]) -> Any:
