@@ -95,7 +95,7 @@ def test_cell_labels_against_twin(n):
     assert of_cell.dtype == np.int64
     assert n_ties > 3
     assert n_empty > 3
-    shown = _painted(owner, of_cell)
+    shown = _painted(owner, of_cell, -1)
     assert (shown == -1).any()
     for voxel in np.ndindex(labels.shape):
         assert shown[voxel] == (-1 if owner[voxel] < 0 else of_cell[owner[voxel]])
@@ -409,3 +409,23 @@ def test_volume_dice_does_not_depend_on_the_unit():
         dice.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))])
     np.testing.assert_allclose(dice[0], dice[1], rtol=1e-6)
     assert 0.5 < dice[0][1] < 1.0
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("is_masked", [False, True])
+def test_dice_by_majority(n, is_masked):
+    """Dice of the labels that most of the voxels in each cell have, whatever labels the cells have."""
+    rng = np.random.default_rng(3)
+    coarse = rng.integers(0, 4, (5,) * n)
+    image = tetopt.Image(np.kron(coarse, np.ones((3, 4, 2)[:n])), random_affine(rng, n))
+    mask = tetopt.Image(rng.random(image.shape) < 0.7, image.affine) if is_masked else None
+    mesh = tetopt.lattice_mesh(image, nodes=100)
+    mesh = tetopt.Mesh(mesh.points, mesh.cells[: len(mesh.cells) // 2])  # the rest is outside
+    owner, inside = tetopt.cell_of_voxel(image, mesh), np.ones(image.shape, bool) if mask is None else mask.data > 0
+    painted = np.full(image.shape, -1 if is_masked else 0)
+    for cell in range(len(mesh.cells)):
+        own = image.data[inside & (owner == cell)].astype(int)
+        painted[owner == cell] = np.argmax(np.bincount(own)) if len(own) else 3
+    for row in label_fidelity(image, mesh, np.full(len(mesh.cells), 3), mask):
+        one, other = inside & (image.data == row.label), painted == row.label
+        assert row.dice_majority == 2 * (one & other).sum() / (one.sum() + other.sum()) != row.dice

@@ -98,6 +98,8 @@ class LabelFidelity(NamedTuple):
         The largest distance, mm: it shows single spikes, unlike a percentile.
     one_layer_fraction : float
         Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick; nan without cells.
+    dice_majority : float
+        `dice` if each cell had the label of most of its voxels: what the mesh allows, whatever its labels.
     thickness_voxels, thickness_mesh : Thickness, optional
         Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
         measured.
@@ -130,6 +132,7 @@ class LabelFidelity(NamedTuple):
     is_lost: bool
     distance_max: float = np.nan
     one_layer_fraction: float = np.nan
+    dice_majority: float = np.nan
     thickness_voxels: Thickness | None = None
     thickness_mesh: Thickness | None = None
     edge: float = np.nan
@@ -276,14 +279,18 @@ def label_fidelity(
     owner = cell_of_voxel(labels, mesh)
     label_of_cell = _majority(labels, mesh, owner) if of_cell is None else checked_cell_labels(of_cell, mesh)
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
-    painted, outside = _painted(owner, label_of_cell), BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    painted[owner < 0] = outside
+    outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
+    most_frequent, most = _most_frequent(true, owner, len(mesh.cells))
+    by_majority = np.where(most > 0, most_frequent, label_of_cell)
+    dice, dice_majority = (
+        _voxel_dice(true, _painted(owner, rows, outside), len(values)) for rows in (label_of_cell, by_majority)
+    )
 
     def counts(rows: NDArray[np.integer], weights: NDArray | None = None) -> NDArray:
-        return np.bincount(rows.ravel(), weights, len(values))
+        return np.bincount(rows, weights, len(values))
 
-    n_true, n_painted, n_both = (counts(v[v >= 0]) for v in (true, painted, true[true == painted]))
-    n_cells, mesh_volume = counts(label_of_cell), counts(label_of_cell, volumes(mesh.points, mesh.cells))
+    n_true, n_cells = counts(true[true >= 0]), counts(label_of_cell)
+    mesh_volume = counts(label_of_cell, volumes(mesh.points, mesh.cells))
     n_empty = counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
     overlap, beyond = _overlaps(Image(true, labels.affine), mesh, label_of_cell, len(n_true))
     has_outside = (np.arange(len(n_true)) == outside).astype(float)
@@ -307,7 +314,7 @@ def label_fidelity(
                 float(mesh_volume[row]),
                 int(n_cells[row]),
                 int(n_empty[row]),
-                _dice(n_both[row], n_true[row], n_painted[row]),
+                float(dice[row]),
                 _dice(
                     overlap[row] + has_outside[row] * beyond[0],
                     n_true[row] * labels.voxel_volume,
@@ -319,6 +326,7 @@ def label_fidelity(
                 bool(n_cells[row] == 0 and (row != outside or owner.min() >= 0)),
                 float(distances.max(initial=0.0)) if len(distances) else np.nan,
                 one_layer.get(int(row), np.nan),
+                float(dice_majority[row]),
             )
         )
     return rows
@@ -491,21 +499,36 @@ def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
 
 
 def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """`cell_labels` from the cell of each voxel, counting only pairs of cell and label that occur."""
-    is_in_mesh = owner >= 0
-    pairs = owner[is_in_mesh] * (LARGEST_LABEL + 1) + labels.data[is_in_mesh].astype(np.int64)
-    pairs, counts = np.unique(pairs, return_counts=True)
-    cell, label = np.divmod(pairs, LARGEST_LABEL + 1)
-    order = np.lexsort((label, -counts, cell))
-    with_voxels, first = np.unique(cell[order], return_index=True)
+    """`cell_labels` from the cell of each voxel."""
+    values, rows, _ = by_row(labels_in_mask(labels, None), np.empty(0, dtype=np.int64))
     of_cell = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
-    of_cell[with_voxels] = label[order[first]]
+    row, most = _most_frequent(rows, owner, len(mesh.cells))
+    of_cell[most > 0] = values[row[most > 0]]
     return of_cell
 
 
-def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Label of the cell that owns each voxel, in the image's shape; -1 outside the mesh."""
-    return np.where(owner >= 0, of_cell[owner], -1)
+def _most_frequent(
+    rows: NDArray[np.int32], owner: NDArray[np.int64], n_cells: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The most frequent row of the voxels of each cell, the smallest of equally frequent ones, and their number."""
+    of_cell, most = np.zeros((2, n_cells), dtype=np.int64)
+    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
+        if box is not None:
+            counts = np.bincount(owner[box][rows[box] == row] + 1, minlength=n_cells + 1)[1:]
+            is_more = counts > most
+            of_cell[is_more], most[is_more] = row, counts[is_more]
+    return of_cell, most
+
+
+def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.int64]:
+    """Label of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
+    return np.append(of_cell, outside)[owner]
+
+
+def _voxel_dice(true: NDArray[np.int32], painted: NDArray[np.int64], n_labels: int) -> NDArray[np.float64]:
+    """Dice of the voxels of each label, (K,), with those that cells give it."""
+    one, other, both = (np.bincount(v[v >= 0], minlength=n_labels) for v in (true, painted, true[true == painted]))
+    return 2.0 * both / np.maximum(one + other, 1)
 
 
 def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:

@@ -171,14 +171,16 @@ def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: i
 def surface_table(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> Table:
-    """Return a table of further measures of labels: Dice by volume, distances, smoothness and topology."""
+    """Return a table of further measures of labels: Dice by volume and majority, distances, smoothness, topology."""
     table = _table_of_labels(
-        "Dice by\nvolume", "distance\nmean, mm", "largest,\nmm", "area\nratio", "folded,\n%", "edges in\n> 2 facets"
-    )
+        "Dice by\nvolume", "Dice by\nmajority", "distance\nmean, mm", "largest,\nmm", "area\nratio", "folded,\n%",
+        "edges in\n> 2 facets",
+    )  # fmt: skip
     for row, surface in zip(rows, interfaces, strict=True):
         table.add_row(
-            _label_words(row.label, names), f"{row.volume_dice:.4f}", size_text(row.distance_mean, 3),
-            size_text(row.distance_max, 3), _decimals(surface.area_ratio, 3), _decimals(100.0 * surface.folded, 1),
+            _label_words(row.label, names), f"{row.volume_dice:.4f}", f"{row.dice_majority:.4f}",
+            size_text(row.distance_mean, 3), size_text(row.distance_max, 3), _decimals(surface.area_ratio, 3),
+            _decimals(100.0 * surface.folded, 1),
             str(surface.nonmanifold_edges),
         )  # fmt: skip
     return table
