@@ -209,6 +209,10 @@ class Attempt(NamedTuple):
     run: Run
 
 
+Search = Generator[Attempt, None, MeshingResult]  # yields attempts, and returns the result that counts
+Attempted = Callable[[Mesh, int | None], Search]  # one attempt, with the number of nodes that exchanges lead to
+
+
 class MeshSearch:
     """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then take the `result`.
 
@@ -216,9 +220,10 @@ class MeshSearch:
     """
 
     result: MeshingResult
+    _told: MeshingResult  # of the last attempt
 
     def __init__(self, image: Image | Content, aim: Aim, **options: Any) -> None:
-        self._begin, self._told = time.perf_counter(), list[MeshingResult]()
+        self._begin, self._seconds = time.perf_counter(), 0.0  # in attempts
         content = plain(image)
         mode = ("graded" if aim.start is None else "start") if aim.mode is None else aim.mode
         _check_names(options, optimize_paper if mode == "paper" else optimize)
@@ -237,24 +242,21 @@ class MeshSearch:
 
     def __iter__(self) -> Iterator[Attempt]:
         """Yield the attempts, each once the result of the last one is told."""
-        content, steps, seconds = self._content, _searched(self._content, self._aim), 0.0
-        initial, nodes = next(steps)
-        while True:
-            initial, n_dropped, dropped = self._carved(initial)
-            check_memory_of(content, max(nodes or 0, len(initial.points)))
-            start_of_run = time.perf_counter()
-            yield Attempt(initial, partial(self._optimised, initial, nodes))
-            seconds += time.perf_counter() - start_of_run
-            result = _with_dropped(self._told.pop(), n_dropped, dropped)._replace(initial=initial, nodes=nodes)
-            try:
-                initial, nodes = steps.send(result)
-            except StopIteration as end:
-                self.result = self._finished(end.value, seconds)
-                return
+        result = yield from _searched(self._content, self._aim, self._attempted)
+        self.result = self._finished(result)
 
     def tell(self, result: MeshingResult) -> None:
         """Take the result of the attempt."""
-        self._told.append(result)
+        self._told = result
+
+    def _attempted(self, initial: Mesh, nodes: int | None) -> Search:
+        """Yield the attempt with an initial mesh, and return its result."""
+        initial, n_dropped, dropped = self._carved(initial)
+        check_memory_of(self._content, max(nodes or 0, len(initial.points)))
+        start_of_run = time.perf_counter()
+        yield Attempt(initial, partial(self._optimised, initial, nodes))
+        self._seconds += time.perf_counter() - start_of_run
+        return _with_dropped(self._told, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
 
     def _carved(self, initial: Mesh) -> tuple[Mesh, int, Counter[int]]:
         """Carve an initial mesh within a mask; also return the number and volumes of dropped components."""
@@ -272,7 +274,7 @@ class MeshSearch:
         exchanged = nodes if mode == "graded" else None
         return optimize(self._content, initial, nodes=exchanged, sizes=self._aim.sizes, **options)
 
-    def _finished(self, result: MeshingResult, seconds: float) -> MeshingResult:
+    def _finished(self, result: MeshingResult) -> MeshingResult:
         """Judge the result by the aim, and curve its surfaces for order 2."""
         content, aim = self._content, self._aim
         is_filled = aim.mode != "start" and content.region is None
@@ -280,23 +282,19 @@ class MeshSearch:
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
             result = result._replace(mesh=mesh, curving=curving)
-        return result._replace(seconds_start=time.perf_counter() - self._begin - seconds, seconds_run=seconds)
+        seconds = time.perf_counter() - self._begin
+        return result._replace(seconds_start=seconds - self._seconds, seconds_run=self._seconds)
 
 
-# A search yields initial meshes, with the number of nodes that exchanges lead to, is sent the run's result, and returns
-# the result that counts.
-Steps = Generator[tuple[Mesh, int | None], MeshingResult, MeshingResult]
-
-
-def _searched(content: Content, aim: Aim) -> Steps:
+def _searched(content: Content, aim: Aim, attempted: Attempted) -> Search:
     """Search for the mesh of an aim."""
     if aim.target_error is not None:
-        return (yield from meshed_to_error(content, aim.target_error, aim.sizes))
+        return meshed_to_error(content, aim.target_error, aim.sizes, attempted)
     if aim.start is not None:
-        return (yield aim.start, None)
+        return attempted(aim.start, None)
     if aim.order == 2 and aim.nodes is not None:
-        return (yield from meshed_in_all(content, aim))
-    return (yield _initial(content, aim, aim.nodes), aim.nodes)
+        return meshed_in_all(content, aim, attempted)
+    return attempted(_initial(content, aim, aim.nodes), aim.nodes)
 
 
 def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
@@ -436,7 +434,7 @@ def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bo
     return False
 
 
-def meshed_in_all(content: Content, aim: Aim) -> Steps:
+def meshed_in_all(content: Content, aim: Aim, attempted: Attempted) -> Search:
     """Repeat runs with other numbers of corners until corners and mid-edge nodes together are the aim's nodes.
 
     Returns the result of the nearest run, or of one that was cut short.
@@ -448,7 +446,7 @@ def meshed_in_all(content: Content, aim: Aim) -> Steps:
         initial = _initial(content, aim, corners := corners_of(nodes, ndim, ratio))
         if _is_repeated(runs, initial, corners, has_exchanges):
             break
-        result = (yield initial, corners)._replace(nodes=nodes)
+        result = (yield from attempted(initial, corners))._replace(nodes=nodes)
         runs.append((initial.points, corners, len(result.mesh.points)))
         if nearest and result.ended in CUT_SHORT:
             return nearest[0][1]._replace(ended=result.ended)
@@ -461,7 +459,7 @@ def meshed_in_all(content: Content, aim: Aim) -> Steps:
     return nearest[0][1]
 
 
-def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None) -> Steps:
+def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None, attempted: Attempted) -> Search:
     """Repeat runs with other numbers of nodes until the unexplained variance is just below a target.
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
@@ -496,7 +494,7 @@ def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None) 
             nodes = len(initial.points)
         if _is_repeated(runs, initial, nodes):
             break
-        result = yield initial, nodes
+        result = yield from attempted(initial, nodes)
         count, fraction = len(result.mesh.points), unexplained_by(content, result.mesh, result.history[-1])
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:
