@@ -164,6 +164,9 @@ def test_a_mask_for_a_mesh_of_the_whole_box(organ, tmp_path, capsys):
     assert set(numbers["violated"]) == {"mask"}  # and not "box", which is the image's
     assert f"Dice of only {numbers['mask']['dice']:.3f}" in numbers["violated"]["mask"]
     assert numbers["fit"]["n_voxels"] == image.data.size
+    tetopt.save_mesh(tmp_path / "side.vtu", tetopt.lattice_mesh(image.box((17, 0, 0), image.shape), nodes=50))
+    assert exit_code("quality", tmp_path / "side.vtu", *words) == 2
+    assert "side.vtu: the mesh lies outside the mask and its surroundings" in capsys.readouterr().err
     what = tetopt.content(image, mask=tetopt.Image(1.0 * corner, image.affine))
     with pytest.warns(UserWarning, match="within none"):
         tetopt.build_model(tetopt.load_mesh(whole), what, young=LAW)

@@ -27,10 +27,6 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
-MASK_WORDS = (
-    "the mesh and the mask overlap with a Dice of only {:.3f}: cells are too large for the mask's detail; allow more "
-    "nodes"
-)
 LABEL_VOXELS = 200  # a label with more voxels must have cells that contain some
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
@@ -38,7 +34,9 @@ BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please rep
 BOUNDARY_ROUNDING = 1e-6  # relative: the same within a boundary with the user's digits
 
 
-def checked(result: MeshingResult, content: Content, min_dihedral: float, start: Mesh) -> MeshingResult:
+def checked(
+    result: MeshingResult, content: Content, min_dihedral: float, start: Mesh, dice: float | None = None
+) -> MeshingResult:
     """Add the requirements that a run's mesh violates to its result, each as a sentence.
 
     Parameters
@@ -51,6 +49,8 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
         The minimum dihedral angle, degrees; 0 for none, and in 2-D.
     start : Mesh
         The mesh that the run began with, whose domain it should cover, if there is no mask.
+    dice : float, optional
+        Dice of the whole mesh with the mask; by default by the content's voxels, which a run's mesh does not leave.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def checked(result: MeshingResult, content: Content, min_dihedral: float, start:
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
     if content.region is not None:
         of_domain = {
-            "mask": partial(_violated_mask, content.image, content.region, result),
+            "mask": partial(_violated_mask, content.image, content.region, result, dice),
             "components": partial(_violated_components, content.region, result.mesh),
         }
     checks: dict[str, Callable[[], dict[str, str]]] = {
@@ -156,16 +156,20 @@ def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
-def _violated_mask(image: Image, region: Region, result: MeshingResult) -> dict[str, str]:
+def _violated_mask(image: Image, region: Region, result: MeshingResult, dice: float | None) -> dict[str, str]:
     violated = {}
     is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
         violated["overlap"] = (
             f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
         )
-    dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
+    if dice is None:
+        dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
-        violated["mask"] = MASK_WORDS.format(dice)
+        violated["mask"] = (
+            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large for the mask's detail; "
+            "allow more nodes"
+        )
     return violated
 
 

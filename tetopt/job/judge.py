@@ -11,7 +11,7 @@ import numpy as np
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
-from tetopt.engine.requirements import ANGLE_ROUNDING, MASK_DICE, MASK_WORDS
+from tetopt.engine.requirements import ANGLE_ROUNDING
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
@@ -187,18 +187,16 @@ def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, 
     """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to mask and labels."""
     source, loaded = cast(Source, judgement.source), judgement.loaded
     mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
-    fit = image_fit(source.image, mesh)
-    result = judged(mesh, source.content, of_cell, **judgement.requirements)
+    fit = image_fit(source.contrasts[0], mesh)
+    measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
+    dice = None if source.mask is None else measured["mask"].dice
+    result = judged(mesh, source.content, of_cell, **judgement.requirements, dice=dice)
+    if result.history[-1].n_voxels == 0:
+        raise InputError(
+            f"{judgement.path}: the mesh lies outside the mask and its surroundings; was it built within another mask?"
+        )
     is_uniform = source.content.variance == 0.0
     fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
-    measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
-    if source.mask is not None:  # the content has the voxels around the mask alone
-        whole = image_fit(source.contrasts[0], mesh)
-        fit = fit._replace(n_voxels=whole.n_voxels, n_empty_cells=whole.n_empty_cells, overlap=whole.overlap)
-        violated = {name: words for name, words in result.violated.items() if name != "mask"}
-        if (dice := measured["mask"].dice) < MASK_DICE:
-            violated["mask"] = MASK_WORDS.format(dice)
-        result = result._replace(violated=violated)
     if not judgement.is_compared:
         measured.pop("mask", None)
     if not source.content.is_plain:

@@ -25,6 +25,7 @@ def judged(
     min_dihedral: float = 0.0,
     target_error: float | None = None,
     is_filled: bool = False,
+    dice: float | None = None,
 ) -> MeshingResult:
     """Treat a mesh as the result of a run, with the `violated` and `fraction` that the run would have.
 
@@ -41,6 +42,8 @@ def judged(
         The allowed unexplained fraction of the variance.
     is_filled : bool
         True if the mesh should fill the image's box.
+    dice : float, optional
+        Dice of the mesh with the mask, over the whole mesh; by default over the content's voxels, around the mask.
 
     Returns
     -------
@@ -54,7 +57,8 @@ def judged(
     """
     E_D, n_voxels = content_E_D(content, mesh)
     row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
-    result = checked(MeshingResult(mesh, [row], "iterations", mesh, labels=labels), content, min_dihedral, mesh)
+    result = MeshingResult(mesh, [row], "iterations", mesh, labels=labels)
+    result = checked(result, content, min_dihedral, mesh, dice)
     result = requested(result, content, target_error, is_filled)
     beyond = violated_box(mesh, content.given) if is_filled or content.region is not None else {}
     return result._replace(violated={**result.violated, **beyond})
