@@ -21,7 +21,9 @@ from tetopt.system.files import checked_output
 
 def segment_command(
     paths: FilesArgument,
-    output: Annotated[Path, Option("LABELS.nii.gz", "The labels to write.", letter="o")],
+    output: Annotated[
+        Path, Option("LABELS.nii.gz", "The classes to write; voxels outside the mesh get 0.", letter="o")
+    ],
     classes: Annotated[int, Option("K", "Number of classes, in order of increasing mean.", least=2)] = 4,
     truth_path: Annotated[
         Path | None, Option("LABELS", "True labels; prints the Dice overlap with them.", "truth")

@@ -80,6 +80,7 @@ class Judgement(NamedTuple):
             "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_fast else 0.0,
             "target_error": None if self.left_out else _number(options.get("target_error")),
             "is_filled": "method" in options and self.is_filled,
+            "is_initial": options.get("iterations") == 0,
         }
 
     def tell(self) -> list[str]:

@@ -26,6 +26,7 @@ def judged(
     target_error: float | None = None,
     is_filled: bool = False,
     dice: float | None = None,
+    is_initial: bool = False,
 ) -> MeshingResult:
     """Treat a mesh as the result of a run, with the `violated` and `fraction` that the run would have.
 
@@ -44,6 +45,8 @@ def judged(
         True if the mesh should fill the image's box.
     dice : float, optional
         Dice of the mesh with the mask, over the whole mesh; by default over the content's voxels, around the mask.
+    is_initial : bool
+        True if the run made no iteration, which the remedies then name.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def judged(
         As for `tetopt.energy.sampling.cell_moments`.
     """
     E_D, n_voxels = content_E_D(content, mesh)
-    row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
+    row = IterationRecord(int(not is_initial), np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
     result = MeshingResult(mesh, [row], "iterations", mesh, labels=labels)
     result = checked(result, content, min_dihedral, mesh, dice)
     result = requested(result, content, target_error, is_filled)
