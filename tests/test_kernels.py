@@ -15,19 +15,7 @@ import pytest
 
 from tetopt.system import cache, kernel_cache, kernels
 from tetopt.system.kernel_types import by_value
-from tetopt.system.kernels import (
-    Bools1,
-    Floats1,
-    Floats2,
-    Floats3,
-    Ints1,
-    entry,
-    helper,
-    own,
-    packed,
-    run,
-    unit,
-)
+from tetopt.system.kernels import Bools1, Floats1, Floats2, Floats3, Ints1, entry, helper, own, packed, run, unit
 
 compiled_only = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="NUMBA_DISABLE_JIT is set: nothing is compiled")
 linked_only = pytest.mark.skipif(kernel_cache.IS_PLAIN, reason="kernels are plain functions of numba's")

@@ -15,15 +15,7 @@ from skfem.helpers import ddot, sym_grad, trace
 
 from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import elasticity
-from tetopt.fem.elasticity import (
-    box_faces,
-    compression,
-    constrained,
-    multigrid,
-    solved,
-    stiffness,
-    strains,
-)
+from tetopt.fem.elasticity import box_faces, compression, constrained, multigrid, solved, stiffness, strains
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes

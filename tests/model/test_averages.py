@@ -8,14 +8,7 @@ import pytest
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.fem.solution import gauss_moduli, solve
 from tetopt.geometry.quadratic import gauss_rule
-from tetopt.model.averages import (
-    cell_values,
-    cell_young,
-    element_young,
-    gauss_young,
-    node_young,
-    parse_average,
-)
+from tetopt.model.averages import cell_values, cell_young, element_young, gauss_young, node_young, parse_average
 from tetopt.model.build import build_model
 from tetopt.model.model import in_units
 from tetopt.start.carve import part_of

@@ -8,11 +8,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
 from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
-from tetopt.model.model import (
-    described,
-    in_space,
-    in_units,
-)
+from tetopt.model.model import described, in_space, in_units
 from tetopt.model.sets import facet_triples
 
 # Units and space

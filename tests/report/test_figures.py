@@ -21,12 +21,7 @@ from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.labels import LabelTable, coloured, table_words
 from tetopt.report import figures
-from tetopt.report.colours import (
-    LISTED_LABELS,
-    UNCOVERED_COLOUR,
-    label_colours,
-    legend_patches,
-)
+from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, label_colours, legend_patches
 from tetopt.report.figures import (
     DETAIL_VOXELS,
     SliceView,

@@ -11,13 +11,7 @@ from tetopt.energy.discretization import cell_E_D
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView
-from tetopt.study.compare_figures import (
-    cutaways,
-    histograms_figure,
-    labels_figure,
-    slices_figure,
-    timing_figure,
-)
+from tetopt.study.compare_figures import cutaways, histograms_figure, labels_figure, slices_figure, timing_figure
 
 
 @pytest.fixture(scope="module")

@@ -62,10 +62,8 @@ def fem_command(
         output = checked_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
         raise InputError("--sets: no file is written; add -o SOLVED.vtu")
-    solved = solve_file(
-        mesh_path, image_path, output, model=model, part=part, compress=compress,
-        conditioning=conditioning,
-    )  # fmt: skip
+    files = (mesh_path, image_path, output)
+    solved = solve_file(*files, model=model, part=part, compress=compress, conditioning=conditioning)
     for first in range(0, len(solved.solutions), STEPS_BESIDE):
         _print(mesh_path.name, solved, slice(first, first + STEPS_BESIDE))
     numbers.save(solved.numbers)
@@ -89,10 +87,8 @@ def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
 def _print(name: str, solved: SolvedModel, shown: slice) -> None:
     """Print a table with a column for each of some steps; that of the first ones describes the model, too."""
     model, solutions, extremes = solved.model, solved.solutions[shown], solved.extremes if shown.start == 0 else None
-    steps = (
-        [f"step {step}" for step in range(1, len(solved.solutions) + 1)][shown] if len(solved.solutions) > 1 else [""]
-    )
-    table = new_table(escape(name), *steps)
+    names = [f"step {step}" for step in range(1, len(solved.solutions) + 1)]
+    table = new_table(escape(name), *(names[shown] if len(names) > 1 else [""]))
     if shown.start == 0:
         moduli = [solutions[0].young.min(), solutions[0].young.max()]
         table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")

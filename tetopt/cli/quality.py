@@ -43,9 +43,8 @@ def quality_command(
     size, source = judgement.numbers["size"], judgement.source
     table = new_table("", escape(mesh.name))
     in_all = [size["n_nodes_in_all"]] if judgement.loaded.order == 2 else []
-    add_quality(
-        table, judgement.shape, in_all=in_all, jacobian=judgement.numbers.get("min_scaled_jacobian"), every=every
-    )
+    jacobian = judgement.numbers.get("min_scaled_jacobian")
+    add_quality(table, judgement.shape, in_all=in_all, jacobian=jacobian, every=every)
     if source is not None and judgement.fit is not None:
         _add_fit(table, judgement.fit, source, judgement.left_out, every)
     print_table(table)
@@ -72,9 +71,7 @@ def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str], e
     if every:
         table.add_row("E_D", f"{fit.E_D:.6g}")
     if fit.E_D_fraction_of_variance is not None:
-        words = f", without its {' and '.join(left_out)}" if left_out else ""
-        table.add_row(
-            f"E_D, fraction of {whose_variance(source.content)}{words}", f"{fit.E_D_fraction_of_variance:.5f}"
-        )
+        whose = whose_variance(source.content) + (f", without its {' and '.join(left_out)}" if left_out else "")
+        table.add_row(f"E_D, fraction of {whose}", f"{fit.E_D_fraction_of_variance:.5f}")
     table.add_row("voxels inside", f"{fit.n_voxels} of {source.contrasts[0].data.size}")
     table.add_row("cells without a voxel centre", str(fit.n_empty_cells))

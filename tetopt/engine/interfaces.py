@@ -19,15 +19,7 @@ from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
-from tetopt.engine.labelling import (
-    Contacts,
-    LabelVoxels,
-    balanced,
-    keeps_topology,
-    label_voxels,
-    labelled,
-    unpinched,
-)
+from tetopt.engine.labelling import Contacts, LabelVoxels, balanced, keeps_topology, label_voxels, labelled, unpinched
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes

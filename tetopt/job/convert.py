@@ -113,9 +113,8 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
         if values.shape[1:] != (9,):  # tensors come with their von Mises stress
             largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
             progress(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}")
-            how = (
-                "too large for a linear solution; check loads, units and fixed sets, unless the solver's was nonlinear"
-            )
+            remedy = "check loads, units and fixed sets, unless the solver's was nonlinear"
+            how = f"too large for a linear solution; {remedy}"
             if values.shape[1:] == (3,) and (words := large_words(loaded.mesh, largest, how)):
                 warning(f"{path}: {name}: {words}")
     loaded = without_results(loaded)

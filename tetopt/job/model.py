@@ -26,15 +26,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import build_model
 from tetopt.model.fields import cell_fields, is_result
-from tetopt.model.file import (
-    MATERIAL_FIELDS,
-    MeshFile,
-    completed,
-    loads_in,
-    moduli_in,
-    sets_beside,
-    without_results,
-)
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, completed, loads_in, moduli_in, sets_beside, without_results
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, other_orders, parse_load
 from tetopt.model.mappings import parse_any_mapping

@@ -174,10 +174,8 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
     if words := locking_words(model):
         warning(words)
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
-    how = (
-        "too large for this linear solution; check loads and fixed sets, or write a file for CalculiX with `nonlinear`"
-    )
-    if (large := large_words(model.mesh, moved, how)) is not None:
+    remedy = "check loads and fixed sets, or write a file for CalculiX with `nonlinear`"
+    if (large := large_words(model.mesh, moved, f"too large for this linear solution; {remedy}")) is not None:
         warning(large)
 
 

@@ -10,13 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import (
-    KEEP_PIECES,
-    background_level,
-    foreground,
-    resample_contrast,
-    resample_labels,
-)
+from tetopt.contents.align import KEEP_PIECES, background_level, foreground, resample_contrast, resample_labels
 from tetopt.contents.content import Content, content, continued
 from tetopt.contents.domain import mask_text
 from tetopt.contents.probabilities import resample_tissue, tissue_labels

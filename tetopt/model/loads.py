@@ -15,13 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import (
-    curved_rule,
-    quadratic,
-    quadratic_facet_nodes,
-    shape_slopes,
-    shape_values,
-)
+from tetopt.geometry.quadratic import curved_rule, quadratic, quadratic_facet_nodes, shape_slopes, shape_values
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of

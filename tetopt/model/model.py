@@ -13,14 +13,7 @@ from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.mesh import Mesh
-from tetopt.model.fields import (
-    GAUSS_MODULI,
-    HALF_TURN,
-    NODE_MODULI,
-    half_turned_fields,
-    node_field,
-    stresses_times,
-)
+from tetopt.model.fields import GAUSS_MODULI, HALF_TURN, NODE_MODULI, half_turned_fields, node_field, stresses_times
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples

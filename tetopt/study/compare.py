@@ -21,15 +21,7 @@ from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.hexahedra import DOF_BYTES
-from tetopt.fem.reference import (
-    Reference,
-    averaged,
-    compare,
-    nearest,
-    reference,
-    reference_shape,
-    refined,
-)
+from tetopt.fem.reference import Reference, averaged, compare, nearest, reference, reference_shape, refined
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image

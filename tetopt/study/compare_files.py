@@ -20,13 +20,7 @@ from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
 from tetopt.study import compare
 from tetopt.study.compare import MadeMesh
-from tetopt.study.compare_figures import (
-    cutaways,
-    histograms_figure,
-    labels_figure,
-    slices_figure,
-    timing_figure,
-)
+from tetopt.study.compare_figures import cutaways, histograms_figure, labels_figure, slices_figure, timing_figure
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import ORDER_WORDS, ImageSource, LabelSource, Report, as_json
 from tetopt.study.options import CompareOptions
