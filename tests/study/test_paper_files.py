@@ -36,7 +36,8 @@ def run(tmp_path_factory, opengl):
     return out
 
 
-@pytest.mark.deep
+@pytest.mark.full
+@pytest.mark.drawn
 def test_files(run):
     assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PAPER_PICTURES}
     for name in PAPER_PICTURES:
@@ -112,7 +113,7 @@ def test_segmentation_improves_on_the_lattice(run):
     assert mean["4 classes, lattice"] < mean["4 classes, optimised"] <= mean["4 classes, voxels"] + 1e-9
 
 
-@pytest.mark.deep
+@pytest.mark.full
 def test_page_in_a_browser(run, tmp_path):
     """Headless Chromium draws the page and reports no script or image error."""
     picture = f"--screenshot={tmp_path / 'page.png'}"
