@@ -449,8 +449,8 @@ def largest_around(values, reach):
     return result
 
 
-def volume_missing(level, inside):
-    """By how much a level is to be lowered in each voxel, so that it has the label's volume within 3 voxels."""
+def volume_by_voxels(level, inside, missing, area):
+    """Add to blocks of two voxels what their level lacks of the label, and the surface's area, voxel by voxel."""
     mean, square = level, np.zeros(level.shape)
     for axis, n in enumerate(level.shape):
         filtered = np.zeros(level.shape)
@@ -459,13 +459,38 @@ def volume_missing(level, inside):
             filtered[p] = 0.75 * mean[p] + 0.125 * (mean[before] + mean[after])
             square[p] += max(abs(level[p] - level[before]), abs(level[after] - level[p])) ** 2
         mean = filtered
-    blocks = tuple(-(-n // 2) for n in level.shape)
-    missing, area = np.zeros(blocks), np.zeros(blocks)
     for p in np.ndindex(level.shape):
         distance = mean[p] / min(max(square[p] ** 0.5, 0.3), 1.0)
         block = tuple(i // 2 for i in p)
         missing[block] += inside[p] - min(max(0.5 - distance, 0.0), 1.0)
         area[block] += abs(distance) < 0.5
+
+
+def volume_between_centres(level, inside, missing, area):
+    """The same by the octants (quadrants) of each cube (square) of voxel centres on both sides of the surface."""
+    corners = list(product((0, 1), repeat=level.ndim))
+    for p in np.ndindex(*(n - 1 for n in level.shape)):
+        voxels = [tuple(i + j for i, j in zip(p, corner, strict=True)) for corner in corners]
+        if len({level[voxel] > 0.0 for voxel in voxels}) == 1:
+            continue
+        for middle, voxel in zip(corners, voxels, strict=True):
+            value, rise = 0.0, np.zeros(level.ndim)
+            for corner, at in zip(corners, voxels, strict=True):
+                weight = [0.75 if i == j else 0.25 for i, j in zip(corner, middle, strict=True)]
+                value += np.prod(weight) * level[at]
+                for axis, side in enumerate(corner):
+                    rise[axis] += (2 * side - 1) * np.prod(weight[:axis] + weight[axis + 1 :]) * level[at]
+            slope = max(np.linalg.norm(rise), 0.3)
+            distance, block = 2.0 * value / slope, tuple(i // 2 for i in voxel)
+            missing[block] += (inside[voxel] - min(max(0.5 - distance, 0.0), 1.0)) / len(corners)
+            area[block] += 2.0 * (abs(distance) < 0.5) / (len(corners) * slope)
+
+
+def volume_missing(level, inside, add_volume):
+    """By how much a level is to be lowered in each voxel, so that it has the label's volume within 3 voxels."""
+    blocks = tuple(-(-n // 2) for n in level.shape)
+    missing, area = np.zeros(blocks), np.zeros(blocks)
+    add_volume(level, inside, missing, area)
     missing, area = blurred(missing, 1.5, True), blurred(area, 1.5, True)
     lowered = np.where(area > 0.01 * 2**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
     result = np.zeros(level.shape)
@@ -481,8 +506,8 @@ def volume_missing(level, inside):
     return result
 
 
-def smooth_level(inside):
-    """A label's level on voxels that are nearly cubes."""
+def smooth_level(inside, settles=False):
+    """The level of a label on voxels that are nearly cubes, or of a mask, which settles."""
     distance = distances_across(inside)
     sign = np.where(inside, -1.0, 1.0)
     size = distance - 0.5
@@ -494,8 +519,11 @@ def smooth_level(inside):
     for _ in range(4):
         fine, broad = ((once := blurred(level, sigma)) + blurred(level - once, sigma) for sigma in (1.0, 3.0))
         smooth = fine + fraction * (broad - fine)
-        smooth = smooth - volume_missing(smooth, inside)
+        smooth = smooth - volume_missing(smooth, inside, volume_by_voxels)
         level = sign * np.clip(sign * smooth, least, most)
+    if settles:
+        level = level - volume_missing(level, inside, volume_between_centres)
+        level = sign * np.clip(sign * level, least, most)
     return np.clip(level, -6.0, 6.0)
 
 

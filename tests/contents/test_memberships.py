@@ -13,6 +13,7 @@ from tetopt.contents.memberships import (
     finer_affine,
     memberships,
     near_distance,
+    smooth_level,
     supersampling,
 )
 
@@ -74,6 +75,9 @@ def test_a_level_as_by_its_plain_twin(shape):
     inside[14, 2], inside[3, 1] = True, False
     members = memberships(tetopt.Image(1.0 * inside))
     np.testing.assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
+    level = smooth_level(inside, inside, np.zeros(shape, dtype=np.float32), (1,), settles=True)
+    np.testing.assert_allclose(level, naive.smooth_level(inside, settles=True), atol=2e-5)
+    assert np.abs(level - members.levels[members.channel[1]]).max() > 1e-3
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9), (3, 40, 2), (1, 7, 30)])

@@ -1,8 +1,8 @@
 """The part of an image's box that a mesh covers: a mask's region, with a surface that is smooth between voxels.
 
 The surface is the zero level of a function at the voxel centres: the signed distance to the mask's surface in voxels,
-negative inside. Smoothing turns stairs of voxels into planes and curves, and moves the surface by less than a fraction
-of a voxel. Between voxel centres the function is linear along each axis.
+negative inside. Smoothing turns stairs of voxels into planes and curves, preserves volumes, and leaves each voxel's
+centre on its side. Between voxel centres the function is linear along each axis.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.memberships import FARTHEST_LEVEL, near_distance, smooth_level
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 
 INSIDE_FRACTION = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
-SMOOTHING_VOXELS = 1.0  # sigma of the Gaussian that smooths the stairs of voxels
-MOST_SMOOTHED_VOXELS = 0.35  # the farthest that smoothing moves the surface
+BEYOND_VOXELS = 4  # voxels beyond the box's sides that smoothing sees, as a box ends near its mask
 ON_SURFACE_VOXELS = 1e-3  # a place whose level is this near to 0 lies on the surface
 
 
@@ -35,26 +35,34 @@ class Region(NamedTuple):
 def region_of(mask: Image) -> Region:
     """The region where a mask of values 0 to 1 is 0.5 or more.
 
-    A mask of two values is smoothed, except where it, or a gap in it, is one or two voxels thick. A mask of fractions
-    defines its surface between the voxels and keeps it.
+    A mask of two values has the smooth surface of a label (`tetopt.contents.memberships.smooth_level`), except where
+    it, or a gap in it, is one voxel thick. A mask of fractions defines its surface between the voxels and keeps it.
+    Where the surface is far, the level counts voxels along the axis on which it is farthest.
     """
     data = mask.data.astype(np.float64)
     inside = data >= INSIDE_FRACTION
     if inside.all():
         return Region(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
-    within, without = scipy.ndimage.distance_transform_edt(inside), scipy.ndimage.distance_transform_edt(~inside)
-    raw = np.where(inside, 0.5 - within, without - 0.5)
+    raw = np.where(inside, 0.5 - near_distance(inside), near_distance(~inside) - 0.5)
     if np.any((data > 0.0) & (data < 1.0)):
-        level = np.where(np.abs(raw) < 1.0, np.clip(0.5 - data, -0.5, 0.5), raw)
+        near = np.where(np.abs(raw) < 1.0, np.clip(0.5 - data, -0.5, 0.5), raw)
     else:
-        once = scipy.ndimage.gaussian_filter(raw, SMOOTHING_VOXELS, mode="nearest")
-        twice = once + scipy.ndimage.gaussian_filter(
-            raw - once, SMOOTHING_VOXELS, mode="nearest"
-        )  # restores the curvature that the first one removed
-        room = np.minimum(scipy.ndimage.maximum_filter(within, size=5), scipy.ndimage.maximum_filter(without, size=5))
-        most = MOST_SMOOTHED_VOXELS * np.clip(room - 1.0, 0.0, 1.0)
-        level = np.clip(twice, raw - most, raw + most)
-    return Region(inside, level.astype(np.float32))
+        near = _smoothed(inside, raw)
+    near = np.clip(near, -FARTHEST_LEVEL, FARTHEST_LEVEL)
+    farther = scipy.ndimage.distance_transform_cdt(np.abs(near) >= FARTHEST_LEVEL)
+    return Region(inside, (near + np.copysign(farther, near)).astype(np.float32))
+
+
+def _smoothed(inside: NDArray[np.bool_], raw: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The smooth level of a mask, but `raw` around sheets and gaps of one voxel, which smoothing would tear."""
+    wide = np.pad(inside, BEYOND_VOXELS, "edge")
+    level = smooth_level(wide, wide, np.zeros(wide.shape, dtype=np.float32), (1,), settles=True)
+    is_single = np.zeros(wide.shape, dtype=bool)
+    for side in (wide, ~wide):
+        is_thick = scipy.ndimage.binary_opening(side, np.ones((2,) * side.ndim))
+        is_single |= side & ~scipy.ndimage.maximum_filter(is_thick, 3)
+    part = (slice(BEYOND_VOXELS, -BEYOND_VOXELS),) * inside.ndim
+    return np.where(scipy.ndimage.maximum_filter(is_single, 3)[part], raw, level[part])
 
 
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:

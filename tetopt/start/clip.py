@@ -86,10 +86,10 @@ def _snapped(
     index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Move nodes that are near to the surface along an edge onto it, unless that flattens a cell."""
-    edge = edge_ends(cells).reshape(-1, 2)
-    a, b = level[edge].T
-    crosses = a * b < 0.0
-    edge, part = edge[crosses], a[crosses] / (a[crosses] - b[crosses])
+    edge = edge_ends(cells)
+    edge = edge[level[edge].prod(axis=2) < 0.0]
+    edge = np.column_stack(np.divmod(np.unique(edge @ [len(level), 1]), len(level)))  # each once
+    part = _crossings(index[edge[:, 0]], index[edge[:, 1]], region)
     is_close = np.zeros(len(level), dtype=bool)
     is_close[edge[part < SNAP_FRACTION, 0]] = True
     is_close[edge[part > 1.0 - SNAP_FRACTION, 1]] = True
@@ -113,10 +113,10 @@ def _snapped(
         moved[back], way[back] = index[back], 0.0
     level = np.where(way > 0.0, 0.0, level)
     # A node that remains very near to a crossing counts as on the surface; it gets there as soon as it moves.
-    edge = edge[level[edge].prod(axis=1) < 0.0]
-    a, b = np.abs(level[edge].T)
-    level[edge[a < TOUCH_FRACTION * (a + b), 0]] = 0.0
-    level[edge[b < TOUCH_FRACTION * (a + b), 1]] = 0.0
+    still_crosses = level[edge].prod(axis=1) < 0.0
+    edge, part = edge[still_crosses], part[still_crosses]
+    level[edge[part < TOUCH_FRACTION, 0]] = 0.0
+    level[edge[part > 1.0 - TOUCH_FRACTION, 1]] = 0.0
     return moved, level
 
 
@@ -171,7 +171,8 @@ def _cut(
     crosses = level[ends].prod(axis=2) < 0.0
     code = np.unique(ends[crosses] @ [n_nodes, 1])
     a, b = np.divmod(code, n_nodes)
-    index = np.vstack([index, _crossings(index[a], index[b], region)])
+    part = _crossings(index[a], index[b], region)[:, None]
+    index = np.vstack([index, index[a] + part * (index[b] - index[a])])
     level = np.append(level, np.zeros(len(code)))
     near = near[crosses.any(axis=1)]
     done, open_cells = [np.delete(cells, near, axis=0)], cells[near]
@@ -191,11 +192,11 @@ def _cut(
 
 
 def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
-    """Places where the surface crosses the edges from a to b, (K, n), by bisection."""
+    """Fractions of the way from a to b (K, n) at which the surface crosses these edges, (K,), by bisection."""
     low, high = np.zeros(len(a)), np.ones(len(a))
     sign = np.sign(levels(region.level, a))
     for _ in range(BISECTION_ROUNDS):
         middle = 0.5 * (low + high)
         is_before = np.sign(levels(region.level, a + middle[:, None] * (b - a))) == sign
         low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
-    return a + (0.5 * (low + high))[:, None] * (b - a)
+    return 0.5 * (low + high)
