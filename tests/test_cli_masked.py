@@ -210,7 +210,9 @@ def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):
     out = ["--average", "mean", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--figures", tmp_path]
     assert exit_code(*words, *out) == 0
     np.testing.assert_array_equal(moduli(tmp_path / "a.vtu"), moduli(organ / "a.vtu"))
-    assert numbers_in(tmp_path / "a.json")["mask"] == pytest.approx(numbers_in(organ / "a.json")["mask"])
+    one, other = (numbers_in(folder / "a.json")["mask"] for folder in (tmp_path, organ))
+    assert one.pop("lost_components") == other.pop("lost_components") == []
+    assert one == pytest.approx(other)
     assert not (tmp_path / "boundary.png").exists()
 
 

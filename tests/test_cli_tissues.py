@@ -32,7 +32,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-LATTICE = ["--spacing", "5", "--iterations", "0"]
+LATTICE = ["--spacing", "3", "--iterations", "0"]
 FEW = ["--nodes", "250", "--iterations", "3"]
 
 

@@ -25,7 +25,7 @@ def labels():
     rows = [
         LabelFidelity(
             100000 + k, 12345678, 1234567.89, 1234567.89, 123456, 0, 1.0 - 0.001 * k, 0.9, 123.456, 123.456, 12, 11,
-            False, 123.4, 0.5, 0.8, thick, thick, 12.34, 12.34,
+            False, 123.4, 0.5, 0.8, 12345678, (), thick, thick, 12.34, 12.34,
         )
         for k in range(N_LABELS)
     ]  # fmt: skip

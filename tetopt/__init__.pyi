@@ -9,6 +9,7 @@ from .contents.align import (
     resample_mask as resample_mask,
 )
 from .contents.content import Content as Content, content as content
+from .contents.labels import LostComponent as LostComponent
 from .contents.probabilities import resample_tissue as resample_tissue, tissue_labels as tissue_labels
 from .contents.statistics import Statistics as Statistics
 from .energy.discretization import E_D as E_D

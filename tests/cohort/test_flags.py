@@ -34,7 +34,7 @@ def test_each_kind_of_odd_subject():
     flipped = {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}
     assert flagged(flipped) == [("grid.orientation", "orientation LPS: 19 of 20 have RAS")]
     assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): it has 3992 voxels but no cell")]
-    assert flagged({"lost": 17}, violated=("labels",)) == flagged({"lost": 17})  # told once
+    assert flagged({"lost": 17}, violated=("labels",)) == [("violated", "violated labels"), *flagged({"lost": 17})]
     assert flagged({"absent": 53}) == [("label", "no label 53 in its image: 19 of 20 have it")]
     assert flagged({}, violated=("min_dihedral",)) == [("violated", "violated min_dihedral")]
     [(column, words)] = flagged({"affine": OBLIQUE})

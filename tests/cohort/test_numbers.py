@@ -93,7 +93,9 @@ def test_numbers_have_names_with_dots():
     run = run_of(RNG)
     run |= {"materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None}, "dropped_components": 2}
     run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6}
+    run["labels"][1]["lost_components"] = [{"voxels": 50, "place": [0.0, 1.0, 2.0]}] * 6
     columns = flattened(run)
+    assert [value for name, value in columns.items() if "lost_components" in name] == [6]
     assert columns["grid.orientation"] == "RAS"
     assert columns["grid.spacing_mm"] == "1 x 1 x 1.2"
     assert columns["grid.shape"] == "180 x 220 x 170"

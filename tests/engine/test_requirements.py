@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+import scipy
 from shapes import shaped
 
 import tetopt
 from tetopt.contents.content import content, plain
-from tetopt.engine.requirements import checked, requested
+from tetopt.engine.requirements import _label_fits, checked, requested
 from tetopt.geometry.check import manifold_problems
+from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.topology import components
+from tetopt.measure.requirements import judged
 from tetopt.start.carve import part_of
 
 
@@ -115,10 +119,12 @@ def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(
     names = {
         "dihedral_angles": "min_dihedral",
         "beyond_box": "box",
-        "cell_of_voxel": "mask",
+        "cell_of_voxel": "mask components",
         "manifold_problems": "manifold",
     }
-    assert violated(target, result) == {names[name]: f"{names[name]} could not be checked: MemoryError"}
+    assert violated(target, result) == {
+        each: f"{each} could not be checked: MemoryError" for each in names[name].split()
+    }
 
 
 def test_an_interface_that_touches_itself():
@@ -134,7 +140,8 @@ def test_an_interface_that_touches_itself():
     labels = np.zeros_like(result.labels)
     labels[star[[one, other]]] = 1
     words = violated(target, result._replace(labels=labels))
-    assert list(words) == ["manifold"]
+    assert list(words) == ["manifold", "labels"]
+    assert "0.0" in words["labels"]
     assert f"[[{node}]]" in words["manifold"]
 
 
@@ -149,8 +156,8 @@ def test_labels_without_cells():
     assert "labels" not in result.violated
     none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
     assert violated(target, none) == {
-        "labels": "no voxel of label 7, of more than 200 voxels, lies in a cell with that label; allow more nodes, or "
-        "a higher `label_weight`"
+        "labels": "no voxel of label 7, of 200 voxels or more, lies in a cell with that label; allow more nodes, more "
+        "`cells_across`, or a higher `label_weight`"
     }
     elsewhere = none.labels.copy()
     elsewhere[np.flatnonzero(result.labels == 3)[0]] = 7
@@ -169,6 +176,75 @@ def test_labels_without_cells():
     assert "labels" not in result.violated
 
 
+@pytest.mark.parametrize("is_masked", [False, True])
+@pytest.mark.parametrize("n", [2, 3])
+def test_labels_are_judged_as_they_are_measured(n, is_masked):
+    """On the voxels of the labels, also of thick slices, in a mesh of a part of the image: the one truth of both."""
+    rng = np.random.default_rng(n)
+    data = np.kron(rng.integers(0, 12, (3, 4, 5)[-n:]), np.ones((6, 8, 7)[-n:]))
+    data[..., -1] = 19.0
+    labels = tetopt.Image(data, np.diag([*(1.0, 1.3, 3.2)[-n:], 1.0]))
+    mask = tetopt.Image(rng.random(data.shape) < 0.9, labels.affine) if is_masked else None
+    target = content(labels, labels, mask)
+    mesh = tetopt.lattice_mesh(labels, nodes=200)
+    along = centroids(mesh.points, mesh.cells)[:, 0]
+    is_kept = along < np.quantile(along, 0.8)
+    mesh, along = part_of(mesh, is_kept), along[is_kept]
+    of_cell = np.where(along < np.median(along), 13, tetopt.cell_labels(labels, mesh))
+    owner = tetopt.cell_of_voxel(target.image, mesh)
+    fits = _label_fits(target, target.memberships, mesh, of_cell, owner)
+    rows = tetopt.label_fidelity(labels, mesh, of_cell, mask)
+    assert [fit.label for fit in fits] == [row.label for row in rows]
+    assert any(fit.components for fit in fits)
+    for fit, row in zip(fits, rows, strict=True):
+        assert (fit.voxels, fit.is_met) == (row.covered_voxels, row.dice > 0.0)
+        assert fit.volume_ratio == pytest.approx(row.mesh_volume / (row.covered_voxels * labels.voxel_volume))
+        assert [each.voxels for each in fit.components] == [each.voxels for each in row.lost_components]
+        for one, other in zip(fit.components, row.lost_components, strict=True):
+            np.testing.assert_allclose(one.place, other.place)
+            assert data[tuple(np.rint(labels.to_index(one.place)).astype(int))] == fit.label
+
+
+def test_volumes_of_labels():
+    """At the limits, of labels of 200 voxels or more alone."""
+    labels = np.zeros((12, 12, 12))
+    labels[:6, :6, :6], labels[8:, 8:, 8:] = 1.0, 2.0
+    image = tetopt.Image(labels)
+    target, mesh = content(image, image), tetopt.lattice_mesh(image, blocks=(12, 12, 12))
+    of_cell = tetopt.cell_labels(image, mesh)
+    assert "labels" not in judged(mesh, target, of_cell).violated
+    rng = np.random.default_rng(5)
+    own, other = (rng.permutation(np.flatnonzero(of_cell == label)) for label in (1, 0))
+    of_cell[np.flatnonzero(of_cell == 2)[::2]] = 0  # it has 64 voxels
+    ratios = []
+    for n_own, n_other in ((0.55, 0.0), (0.65, 0.0), (1.0, 0.35), (1.0, 0.7)):
+        changed = of_cell.copy()
+        changed[own[round(n_own * len(own)) :]] = 0
+        changed[other[: round(n_other * len(own))]] = 1
+        ratios.append(volumes(mesh.points, mesh.cells)[changed == 1].sum() / 216.0)
+        said = judged(mesh, target, changed).violated.get("labels", "")
+        words = f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.2g} for label 1; allow more"
+        assert said.startswith(words) if not 0.6 <= ratios[-1] <= 1.5 else said == ""
+    assert ratios[0] < 0.6 < ratios[1] < ratios[2] < 1.5 < ratios[3]
+
+
+def test_components_of_a_mask_without_a_cell():
+    image, mask = shaped("pieces")
+    target = content(image, mask=mask)
+    result = tetopt.mesh_image(target, 300, iterations=1)
+    assert "components" not in result.violated
+    one = part_of(result.mesh, components(result.mesh.cells) == 0)
+    number, _ = scipy.ndimage.label(mask.data > 0.5)
+    gone = number == next(k for k in (1, 2) if not ((number == k) & (tetopt.cell_of_voxel(mask, one) >= 0)).any())
+    words = judged(one, target).violated["components"]
+    assert words.startswith(f"components of the mask without a cell: {gone.sum()} voxels at (")
+    place = [float(each) for each in words.split("(")[1].split(")")[0].split(", ")]
+    assert gone[tuple(np.rint(mask.to_index(place)).astype(int))]
+    (row,) = tetopt.mask_fidelity(mask, one).lost_components
+    assert row.voxels == gone.sum()
+    np.testing.assert_allclose(row.place, place, atol=1e-3 * np.abs(place).max())
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
 def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
@@ -177,7 +253,8 @@ def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     result = tetopt.mesh_image(content(image, labels, mask), 300, **({"iterations": 4} | options))
     assert set(result.labels.tolist()) == {0, 1, 2}
     assert manifold_problems(result.mesh, result.labels) == []
-    assert not {"manifold", "labels"} & set(result.violated)
+    assert "manifold" not in result.violated
+    assert "no voxel of label" not in result.violated.get("labels", "")
 
 
 @pytest.mark.full

@@ -5,8 +5,10 @@ import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
+from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.requirements import LABEL_REMEDY
 from tetopt.job.advice import agreed, of_empty, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
@@ -77,8 +79,10 @@ def test_components_that_were_dropped_are_told(said):
     assert "as large as 3.5 voxels (label 3 (gland) 1.5, label 0 2); " in said()
 
 
-def label_of(label, mesh_volume=9.0, is_lost=False):
-    return LabelFidelity(label, 9, 9.0, mesh_volume, 3, 0, 0.9, 0.9, 0.1, 0.1, 1, 1, is_lost)
+def label_of(label, mesh_volume=9.0, is_lost=False, voxels=9):
+    dice = 0.0 if is_lost else 0.9
+    row = LabelFidelity(label, voxels, 9.0, mesh_volume, 3, 0, dice, dice, 0.1, 0.1, 1, 1, is_lost)
+    return row._replace(covered_voxels=voxels)
 
 
 def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
@@ -89,20 +93,48 @@ def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
     assert "(ratio in brackets): 5 (0.22), 2 (2.1); allow more nodes" in line
 
 
+def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
+    volumes = (1, 9.0), (2, 13.6), (5, 5.3), (7, 13.4), (8, 5.5)
+    rows = [label_of(k, volume, voxels=200) for k, volume in volumes]
+    assert told(*unmet({}, {"labels": [label_of(k, volume, voxels=199) for k, volume in volumes]})) == {}
+    assert "labels" not in said()
+    names = {"label_names": {5: "wall"}, "labels": rows}
+    words = "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.59 for label 5 (wall), 1.5 for label 2"
+    assert told(*unmet({"labels": "by numbers"}, names)) == {"labels": f"{words}; {LABEL_REMEDY}"}
+    # With a part of the label in the mesh, the volume is that of the part.
+    half = [row._replace(covered_voxels=300, voxels=600, mesh_volume=0.5 * row.mesh_volume) for row in rows]
+    assert told(*unmet({}, names | {"labels": half})) == {"labels": f"{words}; {LABEL_REMEDY}"}
+    few = [row._replace(covered_voxels=199, voxels=398, mesh_volume=0.5 * row.mesh_volume) for row in rows]
+    assert told(*unmet({}, names | {"labels": few})) == {}
+
+
+def test_components_without_a_cell_violate_a_requirement_the_largest_first(said):
+    lost = tuple(LostComponent(n, (1.0, 2.5, 1234.56)) for n in (99, 60, 50, 50))
+    rows = [label_of(3)._replace(lost_components=lost), label_of(4, is_lost=True)._replace(lost_components=lost[:2])]
+    words = told(*unmet({}, {"labels": rows}))["labels"]
+    assert words.startswith("components of labels without a cell: 99 voxels of label 3 at (1, 2.5, 1235) mm, 99 voxels")
+    assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {LABEL_REMEDY}")
+    assert "no cell has label" not in said()  # named above
+    large = [label_of(4, is_lost=True, voxels=200)._replace(lost_components=lost[:2])]
+    assert "components" not in told(*unmet({}, {"labels": large}))["labels"]
+
+
 def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
-    air = label_of(0, 2.0)._replace(voxels=300, dice=0.1)
-    for word, rows, n_remedies in (
-        ("foreground", [air], 0),
-        ("mask", [air], 2),
-        ("foreground", [air, label_of(2, 2.0)], 1),
+    air = label_of(0, 2.0, voxels=300)
+    for word, rows, n_lines, n_remedies in (
+        ("foreground", [air], 1, 0),
+        ("mask", [air], 1, 1),
+        ("foreground", [air, label_of(2, 2.0)], 2, 1),
+        ("foreground", [air._replace(mesh_volume=9.0, dice=0.1)], 1, 0),
+        ("mask", [air._replace(mesh_volume=9.0, dice=0.1)], 1, 1),
     ):
         told(*unmet({}, {"labels": rows}, word))
         text = said()
-        assert text.count("\n") == 2
+        assert text.count("\n") == n_lines
         assert text.count("allow more nodes") == n_remedies
-        assert text.count("0 (voxels without a label, enclosed or bright)") == (2 if word == "foreground" else 0)
-    told(*unmet({"labels": "..."}, {"labels": [air._replace(is_lost=True)]}, "foreground"))
-    assert said().endswith("of more than 200 voxels, lies in a cell with that label\n")
+        assert text.count("0 (voxels without a label, enclosed or bright)") == (word == "foreground")
+    told(*unmet({"labels": "..."}, {"labels": [air._replace(dice=0.0)]}, "foreground"))
+    assert said().endswith("of 200 voxels or more, lies in a cell with that label\n")
 
 
 def ended(E=0.5, E_D=0.5):

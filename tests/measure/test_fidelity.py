@@ -336,7 +336,7 @@ def test_mask_of_a_shifted_plane(n):
     assert fidelity.dice == pytest.approx(2 * 4 / (4 + 6))
     np.testing.assert_allclose(fidelity[4:8], 2.0, atol=1e-9)
     np.testing.assert_allclose(fidelity[8:12], 3.0, atol=1e-9)
-    assert fidelity[12:] == (1, 1, 1, 1)
+    assert fidelity[12:] == (1, 1, 1, 1, ())
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -354,7 +354,7 @@ def test_mask_of_a_ball(n):
     assert factors[-1] * 1.5 < fidelity.distance_mean_mm < factors[0] * 1.5
     assert factors[-1] * 1.5 < fidelity.reverse_p95_mm < factors[0] * 1.55
     euler = {2: 0, 3: 2}[n]
-    assert fidelity[12:] == (1, 1, euler, euler)
+    assert fidelity[12:] == (1, 1, euler, euler, ())
 
 
 def test_mask_reverse_is_another_distance():

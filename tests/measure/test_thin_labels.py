@@ -174,7 +174,9 @@ def texts(table):
 
 def test_tables_have_the_worst_five_alone():
     rows = [
-        LabelFidelity(*(9,) * 12, False, 1.0, fraction, 0.9, Thickness(1.0, 2.0, 3.0), None)._replace(label=label)
+        LabelFidelity(*(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0), None)._replace(
+            label=label
+        )
         for label, fraction in zip(range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True)
     ]
     shown = texts(thin_table(rows, {rows[0].label: "bone [l]"}))

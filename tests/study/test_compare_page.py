@@ -264,7 +264,7 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
 def test_labels_of_any_size_count_where_none_is_large(tmp_path):
     """And of classes of intensities also the first, which is no background."""
     report = fake_report()
-    rows = [LabelFidelity(*[None] * 20)._replace(label=k, voxels=9, volume=9.0, mesh_volume=9.0, is_lost=False)
+    rows = [LabelFidelity(*[None] * 22)._replace(label=k, voxels=9, volume=9.0, mesh_volume=9.0, is_lost=False)
             for k in range(2)]  # fmt: skip
     for number in range(5):
         fidelity = [row._replace(dice=dice, distance_mean=1.0) for row, dice in zip(rows, (0.4, 0.6), strict=True)]

@@ -152,8 +152,7 @@ Flagged = Iterator[tuple[int, Flag]]
 def _violations(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     for place, row in enumerate(rows):
         for name in row.violated:
-            if not (name == "labels" and row.n_lost):
-                yield place, Flag("violated", f"violated {name}", np.inf)
+            yield place, Flag("violated", f"violated {name}", np.inf)
         for number, n_voxels in row.n_lost.items():
             words = f"lost label {label_words(number, names)}"
             yield place, Flag("label", f"{words}: it has {n_voxels} voxels but no cell", np.inf)

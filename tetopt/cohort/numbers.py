@@ -113,8 +113,8 @@ def flattened(run: dict[str, Any]) -> dict[str, Value]:
     Names of nested objects are joined by dots. Labels have a column per number, `labels.17.dice` and
     `interfaces.17.area`; contrasts have `contrasts.1.weight` and so on; short lists of numbers have one column each
     (`spacing_mm.1`), and lists of texts are joined. Given options that are not among `options` are in
-    `request.options`. Orientation and sides of the image come from its affine. `UNLISTED_NUMBERS` and lists of more
-    than four numbers are left out.
+    `request.options`. Orientation and sides of the image come from its affine. Lost components are counted.
+    `UNLISTED_NUMBERS` and lists of more than four numbers are left out.
     """
     columns = _grid(run["box"]) if run.get("box") else {}
     for name, value in run.items():
@@ -138,6 +138,8 @@ def _put(columns: dict[str, Value], name: str, value: Any) -> None:
     if isinstance(value, dict):
         for key, item in value.items():
             _put(columns, f"{name}.{plain(key)}", item)
+    elif name.endswith(".lost_components"):
+        columns[intern(name)] = len(value)
     elif isinstance(value, list):
         if all(isinstance(item, str) for item in value):
             columns[intern(name)] = "; ".join(map(plain, value))

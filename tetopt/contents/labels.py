@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, warn
-from tetopt.image import Image
+from tetopt.image import Image, transformed
 
 LARGEST_LABEL = 2**31 - 1  # largest signed 32-bit integer, the widest type of labels in most programs
 ROUNDING_DISTANCE = 1e-3  # by which values may differ from whole numbers: interpolated or scaled headers leave less
@@ -33,6 +34,7 @@ LABEL_PALETTE = (
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
 LABEL_TINTS = (0.0, -0.4, 0.4)  # variants of the palette as it repeats: unchanged, mixed with black, mixed with white
+COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
 BACKGROUND_LABEL = 0  # the label outside all tissues
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
@@ -91,6 +93,48 @@ def _neighbours(data: NDArray, axis: int) -> tuple[NDArray, NDArray]:
     """Return the values of all pairs of voxels that are neighbours along an axis."""
     along = np.moveaxis(data, axis, 0)
     return along[:-1], along[1:]
+
+
+class LostComponent(NamedTuple):
+    """A face-connected component of a label's or mask's voxels, of 50 or more, none of which lies in a cell of it.
+
+    Parameters
+    ----------
+    voxels : int
+        Number of its voxels.
+    place : tuple of float
+        World coordinates of the voxel nearest to their mean, mm.
+
+    Examples
+    --------
+    >>> tetopt.LostComponent(60, (12.0, 4.5, 7.0)).voxels
+    60
+    """
+
+    voxels: int
+    place: tuple[float, ...]
+
+
+def voxel_components(
+    inside: NDArray[np.bool_], is_met: NDArray[np.bool_], affine: NDArray[np.float64], box: Sequence[slice] = ()
+) -> tuple[int, tuple[LostComponent, ...]]:
+    """Number of face-connected components of voxels, and large ones without one that `is_met`, the largest first.
+
+    The voxels are in a `box` of the grid with this affine, by default at its corner.
+    """
+    start = [side.start for side in box] or 0
+    number, n_components = scipy.ndimage.label(inside)
+    sizes, met = (np.bincount(number[which], minlength=n_components + 1) for which in (inside, inside & is_met))
+    lost = np.flatnonzero((sizes >= COMPONENT_VOXELS) & (met == 0))
+    boxes = scipy.ndimage.find_objects(number) if len(lost) else []
+    rows = []
+    for component in lost[np.argsort(-sizes[lost], kind="stable")].tolist():
+        near = boxes[component - 1]
+        index = np.argwhere(number[near] == component) + [side.start for side in near]
+        middle = index[np.argmin(((index - index.mean(axis=0)) ** 2).sum(axis=1))] + start
+        place = transformed(middle, affine[:-1, :-1]) + affine[:-1, -1]
+        rows.append(LostComponent(int(sizes[component]), tuple(place.tolist())))
+    return n_components, tuple(rows)
 
 
 def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:

@@ -6,28 +6,36 @@ the command exits with status 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, partial
 from math import prod
+from typing import NamedTuple
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import Region
+from tetopt.contents.labels import BACKGROUND_LABEL, LostComponent, voxel_components
+from tetopt.contents.memberships import Memberships, supersampling
 from tetopt.energy.discretization import unexplained
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
+from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, volumes
 from tetopt.geometry.topology import components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.carve import n_components
 
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
-LABEL_VOXELS = 200  # a label with more voxels must have cells that contain some
+LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
+LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
+LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
+COMPONENTS_LISTED = 5  # of those without a cell
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
 BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
@@ -58,24 +66,27 @@ def checked(
         With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes
         farther beyond the image's box than the initial mesh's. `cover`: voxels or volume lost or gained relative to the
         initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
-        two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask.
+        two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask, or
+        components of the mask of 50 voxels or more without a cell.
         `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
-        manifold. `labels`: labels of more than 200 voxels none of which lies in a cell
-        with that label. A requirement that cannot be checked, for lack
+        manifold. `labels`: labels of 200 voxels or more none of which lies in a cell
+        with that label, or whose cells have less than 0.6 or more than 1.5 times their volume, and components of labels
+        of 50 voxels or more without a cell. A requirement that cannot be checked, for lack
         of memory, counts as violated, with the reason, and the mesh is kept.
     """
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
-    if content.region is not None:
+    owner = cache(partial(cell_of_voxel, content.image, result.mesh))
+    if (region := content.region) is not None:
         of_domain = {
-            "mask": partial(_violated_mask, content.image, content.region, result, dice),
-            "components": partial(_violated_components, content.region, result.mesh),
+            "mask": lambda: _violated_mask(region, result, owner(), dice),
+            "components": lambda: _violated_components(content, region, result.mesh, owner()),
         }
     checks: dict[str, Callable[[], dict[str, str]]] = {
         "min_dihedral": lambda: _violated_min_dihedral(result, min_dihedral),
         "box": lambda: violated_box(result.mesh, content.image, start),
         **of_domain,
         "manifold": lambda: _violated_manifold(content, result),
-        "labels": lambda: _violated_labels(content, result),
+        "labels": lambda: _violated_labels(content, result, owner),
     }
     violated: dict[str, str] = {}
     for name, check in checks.items():
@@ -156,9 +167,11 @@ def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
-def _violated_mask(image: Image, region: Region, result: MeshingResult, dice: float | None) -> dict[str, str]:
+def _violated_mask(
+    region: Region, result: MeshingResult, owner: NDArray[np.int64], dice: float | None
+) -> dict[str, str]:
     violated = {}
-    is_covered, inside = cell_of_voxel(image, result.mesh) >= 0, region.inside
+    is_covered, inside = owner >= 0, region.inside
     if twice := result.history[-1].n_voxels - int(is_covered.sum()):
         violated["overlap"] = (
             f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
@@ -173,12 +186,15 @@ def _violated_mask(image: Image, region: Region, result: MeshingResult, dice: fl
     return violated
 
 
-def _violated_components(region: Region, mesh: Mesh) -> dict[str, str]:
-    n_cells = np.sort(np.bincount(components(mesh.cells)))[::-1]
-    if len(n_cells) == 1 or len(n_cells) <= (n_mask := n_components(region)):
-        return {}
-    words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
-    return {"components": f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells; allow more nodes"}
+def _violated_components(content: Content, region: Region, mesh: Mesh, owner: NDArray[np.int64]) -> dict[str, str]:
+    n_cells, texts = np.sort(np.bincount(components(mesh.cells)))[::-1], []
+    planes, affine = _own_voxels(content)
+    n_mask, lost = voxel_components(region.inside[planes], owner[planes] >= 0, affine)
+    if len(n_cells) > max(n_mask, 1):
+        words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
+        texts.append(f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells")
+    texts += [f"components of the mask without a cell: {_listed([(each, '') for each in lost])}"] if lost else []
+    return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
 def _violated_manifold(content: Content, result: MeshingResult) -> dict[str, str]:
@@ -188,24 +204,103 @@ def _violated_manifold(content: Content, result: MeshingResult) -> dict[str, str
     return {"manifold": "; ".join([*problems, "allow more nodes"])} if problems else {}
 
 
-def _violated_labels(content: Content, result: MeshingResult) -> dict[str, str]:
-    members = content.memberships
-    if members is None or result.labels is None:
+class LabelFit(NamedTuple):
+    """How a label's cells represent it, as far as a requirement."""
+
+    label: int
+    voxels: int  # of it that cells should represent
+    volume_ratio: float  # of its cells to its voxels
+    is_met: bool  # one of its voxels, or more, lies in a cell with the label
+    components: tuple[LostComponent, ...]  # of its voxels, in which none does
+
+    @property
+    def is_lost(self) -> bool:
+        """True for a large label without a cell, or with cells elsewhere."""
+        return self.voxels >= LABEL_VOXELS and not self.is_met
+
+    @property
+    def is_off(self) -> bool:
+        """True if a large label has cells of too much or too little volume."""
+        return self.voxels >= LABEL_VOXELS and self.is_met and not LEAST_VOLUME <= self.volume_ratio <= MOST_VOLUME
+
+    @property
+    def is_faulty(self) -> bool:
+        """True if the label violates the requirement."""
+        return self.is_lost or self.is_off or len(self.pieces) > 0
+
+    @property
+    def pieces(self) -> tuple[LostComponent, ...]:
+        """The components of a tissue that has cells elsewhere; those of the space between tissues do not count."""
+        return () if self.is_lost or self.label == BACKGROUND_LABEL else self.components
+
+
+def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:
+    """Describe labels that violate the requirement, each by its words; empty if none does."""
+    faulty, texts = [fit for fit in fits if fit.is_faulty], []
+    if lost := [words[fit.label] for fit in faulty if fit.is_lost]:
+        texts.append(
+            f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a cell with that label"
+        )
+    off = sorted((fit for fit in faulty if fit.is_off), key=lambda fit: -abs(np.log(fit.volume_ratio)))
+    if off:
+        rows = ", ".join(f"{fit.volume_ratio:.2g} for label {words[fit.label]}" for fit in off)
+        texts.append(f"the volume of cells is not {LEAST_VOLUME:g} to {MOST_VOLUME:g} times that of voxels: {rows}")
+    pieces = [(each, f" of label {words[fit.label]}") for fit in faulty for each in fit.pieces]
+    texts += [f"components of labels without a cell: {_listed(pieces)}"] if pieces else []
+    return "; ".join(texts)
+
+
+def _listed(pieces: list[tuple[LostComponent, str]]) -> str:
+    """List the largest components, each with words on it."""
+    ranked = sorted(pieces, key=lambda piece: -piece[0].voxels)
+    rows = [
+        f"{each.voxels} voxels{words} at ({', '.join(f'{x:.4g}' for x in each.place)}) mm"
+        for each, words in ranked[:COMPONENTS_LISTED]
+    ]
+    return ", ".join(rows) + (f" and {len(ranked) - len(rows)} more" if len(ranked) > len(rows) else "")
+
+
+def _violated_labels(content: Content, result: MeshingResult, owner: Callable[[], NDArray[np.int64]]) -> dict[str, str]:
+    if content.memberships is None or result.labels is None:
         return {}
-    owner = cell_of_voxel(content.image, result.mesh)
-    is_inside = owner >= 0 if content.region is None else content.region.inside
-    counts = np.bincount(members.partition[is_inside].ravel(), minlength=len(members.labels))
-    is_right = (owner >= 0) & (members.labels[members.partition] == result.labels[owner])
-    is_kept = np.bincount(members.partition[is_right].ravel(), minlength=len(members.labels)) > 0
-    lost = members.labels[(counts > LABEL_VOXELS * members.parts) & ~is_kept]
-    return (
-        {"labels": f"{lost_words(map(str, lost))}; allow more nodes, or a higher `label_weight`"} if len(lost) else {}
-    )
+    fits = _label_fits(content, content.memberships, result.mesh, result.labels, owner())
+    text = label_faults(fits, {fit.label: str(fit.label) for fit in fits})
+    return {"labels": f"{text}; {LABEL_REMEDY}"} if text else {}
 
 
-def lost_words(labels: Iterable[str]) -> str:
-    """Say that large labels have no cells, or have them elsewhere alone."""
-    return f"no voxel of label {', '.join(labels)}, of more than {LABEL_VOXELS} voxels, lies in a cell with that label"
+def _label_fits(
+    content: Content, members: Memberships, mesh: Mesh, of_cell: NDArray[np.int64], owner: NDArray[np.int64]
+) -> list[LabelFit]:
+    """Compare each label with its cells, as `tetopt.measure.fidelity.label_fidelity` does."""
+    planes, affine = _own_voxels(content)
+    owner, rows = owner[planes], members.partition[planes]
+    is_covered, outside = owner >= 0, BACKGROUND_LABEL
+    if content.region is not None:
+        is_covered, outside = content.region.inside[planes], OUTSIDE_LABEL
+        rows = np.where(is_covered, rows, OUTSIDE_LABEL)
+    painted = np.append(of_cell, outside)[owner]
+    numbers, place = np.unique(of_cell, return_inverse=True)
+    sizes = np.bincount(place, volumes(mesh.points, mesh.cells)) / (content.image.voxel_volume * members.parts)
+    n_in_cells, fits = dict(zip(numbers.tolist(), sizes.tolist(), strict=True)), []
+    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
+        if box is not None:
+            label, own = int(members.labels[row]), rows[box] == row
+            is_met, n_covered = painted[box] == label, int(np.count_nonzero(own & is_covered[box]))
+            lost = voxel_components(own, is_met | ~is_covered[box], affine, box)[1]
+            ratio = n_in_cells.get(label, 0.0) / max(n_covered, 1)
+            fits.append(LabelFit(label, n_covered, ratio, bool((own & is_met).any()), lost))
+    return fits
+
+
+def _own_voxels(content: Content) -> tuple[tuple[slice, ...], NDArray[np.float64]]:
+    """Select the voxels of a content that have the centres of its image's own voxels; also return their affine."""
+    image, factors = content.image, (1,) * content.image.ndim
+    if content.memberships is not None:
+        factors = supersampling(content.given.spacing)
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([factor // 2 for factor in factors])
+    affine[:-1, :-1] *= factors
+    return tuple(slice(factor // 2, None, factor) for factor in factors), affine
 
 
 def _volume(mesh: Mesh) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.requirements import LABEL_VOXELS, lost_words
+from tetopt.engine.requirements import LABEL_REMEDY, LABEL_VOXELS, LabelFit, label_faults
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
@@ -92,7 +92,7 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
 
 
 def unmet(requirements: Mapping[str, str], measured: dict[str, Any], word: str = "mask") -> Iterator[Problem]:
-    """Yield violated `requirements` (`tetopt.engine.requirements`), including large labels without cells, and lesser
+    """Yield violated `requirements` (`tetopt.engine.requirements`), that on labels with their names, and lesser
     deviations from mask and labels. `word` is the name of the meshed region in messages."""
     of_labels = list(_lost(measured, word))
     for name, words in requirements.items():
@@ -118,31 +118,36 @@ def _dropped_words(measured: dict[str, Any]) -> str:
 
 
 def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
-    """Yield labels of more than 200 voxels without a cell, smaller ones, and those of poor volume or overlap.
+    """Yield labels that violate the requirement, small ones without a cell, and those of poor volume or overlap.
 
     More nodes are no remedy for label 0 within a foreground: it has the voxels that are no background.
     """
     labels, pockets = measured.get("labels", []), {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {}
-    lost = [row for row in labels if row.is_lost]
     words = {row.label: label_words(row.label, measured.get("label_names", {}) | pockets) for row in labels}
+    ratios = {row: row.mesh_volume / row.volume * row.voxels / max(row.covered_voxels, 1) for row in labels}
+    fits = {
+        row: LabelFit(row.label, row.covered_voxels, ratio, row.dice > 0.0, row.lost_components)
+        for row, ratio in ratios.items()
+    }
 
     def smaller(rows: Iterable[LabelFidelity], remedy: str) -> dict[str, Any]:
         is_helped = any(row.label not in pockets for row in rows)
         return {"remedy": remedy, "wants": "smaller"} if is_helped else {}
 
-    if large := [row for row in labels if row.voxels > LABEL_VOXELS and (row.is_lost or row.dice == 0.0)]:
-        text = lost_words(words[row.label] for row in large)
-        yield Problem(text, name="labels", **smaller(large, "allow more nodes, or a higher `label_weight`"))
-    if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
-        yield Problem(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
-    ratios = {row: row.mesh_volume / row.volume for row in labels if not row.is_lost and row.mesh_volume > 0.0}
-    far = [row for row, ratio in ratios.items() if max(ratio, 1.0 / ratio) > VOLUME_RATIO]
+    if faulty := [row for row, fit in fits.items() if fit.is_faulty]:
+        text = label_faults(fits.values(), words)
+        yield Problem(text, name="labels", **smaller(faulty, LABEL_REMEDY))
+    others = [row for row in labels if row not in faulty]
+    if small := [words[row.label] for row in others if row.is_lost]:
+        yield Problem(f"no cell has label {', '.join(small)}, of fewer than {LABEL_VOXELS} voxels in the mesh")
+    there = [row for row in others if row.covered_voxels and row.mesh_volume > 0.0]
+    far = [row for row in there if max(ratios[row], 1.0 / ratios[row]) > VOLUME_RATIO]
     if far := sorted(far, key=lambda row: -max(ratios[row], 1.0 / ratios[row])):
         worst = ", ".join(f"{words[row.label]} ({ratios[row]:.2g})" for row in far)
         count = "1 label" if len(far) == 1 else f"{len(far)} labels"
         text = f"{count} with more than {VOLUME_RATIO:g} times the volume of the voxels, or less than half"
         yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
-    poor = [row for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE and row not in large]
+    poor = [row for row in others if row.voxels >= LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor:
         names = listed([words[row.label] for row in poor], 5)
         remedy = "allow more nodes, or check that these are labels, not intensities"

@@ -18,7 +18,13 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL, checked_labels
+from tetopt.contents.labels import (
+    BACKGROUND_LABEL,
+    LARGEST_LABEL,
+    LostComponent,
+    checked_labels,
+    voxel_components,
+)
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box
@@ -100,6 +106,10 @@ class LabelFidelity(NamedTuple):
         Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick; nan without cells.
     dice_majority : float
         `dice` if each cell had the label of most of its voxels: what the mesh allows, whatever its labels.
+    covered_voxels : int
+        Number of its voxels that cells should represent: those in the mesh or, with a mask, all.
+    lost_components : tuple of LostComponent
+        Components of 50 of these voxels or more, none of which lies in a cell with the label.
     thickness_voxels, thickness_mesh : Thickness, optional
         Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
         measured.
@@ -133,6 +143,8 @@ class LabelFidelity(NamedTuple):
     distance_max: float = np.nan
     one_layer_fraction: float = np.nan
     dice_majority: float = np.nan
+    covered_voxels: int = 0
+    lost_components: tuple[LostComponent, ...] = ()
     thickness_voxels: Thickness | None = None
     thickness_mesh: Thickness | None = None
     edge: float = np.nan
@@ -169,6 +181,8 @@ class MaskFidelity(NamedTuple):
         Euler characteristic of the mask's half level: 2 for each closed component, minus 2 for each handle.
     mesh_euler : int
         Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends there has 1.
+    lost_components : tuple of LostComponent
+        Components of 50 voxels or more, none of which lies in a cell.
 
     Examples
     --------
@@ -196,6 +210,7 @@ class MaskFidelity(NamedTuple):
     mesh_components: int
     euler: int
     mesh_euler: int
+    lost_components: tuple[LostComponent, ...] = ()
 
 
 def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
@@ -280,16 +295,17 @@ def label_fidelity(
     label_of_cell = _majority(labels, mesh, owner) if of_cell is None else checked_cell_labels(of_cell, mesh)
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    most_frequent, most = _most_frequent(true, owner, len(mesh.cells))
-    by_majority = np.where(most > 0, most_frequent, label_of_cell)
-    dice, dice_majority = (
-        _voxel_dice(true, _painted(owner, rows, outside), len(values)) for rows in (label_of_cell, by_majority)
-    )
+    painted, is_covered = _painted(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
+    is_met = (painted == true) | ~is_covered
+    dice = _voxel_dice(true, painted, len(values))
+    of_most = _painted(owner, _most_frequent(true, owner, label_of_cell), outside)
+    dice_majority = _voxel_dice(true, of_most, len(values))
 
     def counts(rows: NDArray[np.integer], weights: NDArray | None = None) -> NDArray:
         return np.bincount(rows, weights, len(values))
 
     n_true, n_cells = counts(true[true >= 0]), counts(label_of_cell)
+    n_covered = counts(true[is_covered & (true >= 0)])
     mesh_volume = counts(label_of_cell, volumes(mesh.points, mesh.cells))
     n_empty = counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
     overlap, beyond = _overlaps(Image(true, labels.affine), mesh, label_of_cell, len(n_true))
@@ -301,7 +317,8 @@ def label_fidelity(
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
     for row in np.flatnonzero(n_true):
-        part, affine = _with_margin(labels, true, boxes[row])
+        part, affine = _with_margin(labels, true, box := boxes[row])
+        n_components, lost = voxel_components(true[box] == row, is_met[box], labels.affine, box)
         is_side = (sides == row).sum(axis=1) == 1
         distances = np.concatenate(
             _distances(FacetSurface(mesh.points, nodes[is_side]), half_level_surface(part == row, affine), face)
@@ -321,12 +338,14 @@ def label_fidelity(
                     mesh_volume[row] + has_outside[row] * beyond[1],
                 ),
                 *_mean_and_p95(distances),
-                int(scipy.ndimage.label(part == row)[1]),
+                n_components,
                 _n_components(mesh.cells[label_of_cell == row]),
                 bool(n_cells[row] == 0 and (row != outside or owner.min() >= 0)),
                 float(distances.max(initial=0.0)) if len(distances) else np.nan,
                 one_layer.get(int(row), np.nan),
                 float(dice_majority[row]),
+                int(n_covered[row]),
+                lost,
             )
         )
     return rows
@@ -387,6 +406,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
     is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_FRACTION
+    n_components, lost = voxel_components(is_inside, is_filled, mask.affine)
     n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
     outer, is_on_box = facets_on_box(mesh, mask)
     ours = FacetSurface(mask.to_index(mesh.points), outer[~is_on_box])
@@ -406,10 +426,11 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
         *_mean_and_p95(back),
         *_mean_and_p95(there_mm),
         *_mean_and_p95(back_mm),
-        int(scipy.ndimage.label(is_inside)[1]),
+        n_components,
         _n_components(mesh.cells),
         euler_characteristic(theirs.facets),
         euler_characteristic(ours.facets),
+        lost,
     )
 
 
@@ -500,24 +521,22 @@ def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
 
 def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
     """`cell_labels` from the cell of each voxel."""
-    values, rows, _ = by_row(labels_in_mask(labels, None), np.empty(0, dtype=np.int64))
-    of_cell = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
-    row, most = _most_frequent(rows, owner, len(mesh.cells))
-    of_cell[most > 0] = values[row[most > 0]]
-    return of_cell
+    nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
+    values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
+    return values[_most_frequent(rows, owner, nearest)]
 
 
 def _most_frequent(
-    rows: NDArray[np.int32], owner: NDArray[np.int64], n_cells: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The most frequent row of the voxels of each cell, the smallest of equally frequent ones, and their number."""
-    of_cell, most = np.zeros((2, n_cells), dtype=np.int64)
+    rows: NDArray[np.int32], owner: NDArray[np.int64], otherwise: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The most frequent row of the voxels of each cell, the smallest of equally frequent ones, or `otherwise` (M,)."""
+    of_cell, most = otherwise.copy(), np.zeros_like(otherwise)
     for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
         if box is not None:
-            counts = np.bincount(owner[box][rows[box] == row] + 1, minlength=n_cells + 1)[1:]
+            counts = np.bincount(owner[box][rows[box] == row] + 1, minlength=len(most) + 1)[1:]
             is_more = counts > most
             of_cell[is_more], most[is_more] = row, counts[is_more]
-    return of_cell, most
+    return of_cell
 
 
 def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.int64]:

@@ -81,11 +81,6 @@ def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
     return Mesh(mesh.points[used], cells)
 
 
-def n_components(region: Region) -> int:
-    """Connected components of a mask's voxels, linked by faces."""
-    return int(scipy.ndimage.label(region.inside)[1])
-
-
 def _home(
     voxel: tuple[NDArray[np.int64], ...], number: NDArray[np.int64], size: NDArray[np.float64], region: Region
 ) -> NDArray[np.int64]:
