@@ -11,7 +11,7 @@ from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, interface_energy, node_stars, remeasure
 from tetopt.engine.density import Limits, exchange
 from tetopt.engine.flips import flip
-from tetopt.engine.interfaces import relabel, with_labels
+from tetopt.engine.interfaces import with_labels
 from tetopt.engine.loop import GRADED_K_D
 from tetopt.engine.repair import repair
 from tetopt.engine.smooth import attract, blocks, star_tension, sweep
@@ -100,18 +100,12 @@ def exchanged(state):
     return exchange(state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0, np.full(n_nodes, np.inf))).state
 
 
-def relabelled(state):
-    relabel(state, node_stars(state))
-    return state
-
-
 MOVES = {
     "sweep": swept,
     "attract": attracted,
     "flip": lambda state: flip(state)[0],
     "exchange": exchanged,
     "repair": lambda state: repair(state, 25.0).state,
-    "relabel": relabelled,
 }
 
 
@@ -121,7 +115,7 @@ def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
     state, target, grid = labelled_state(name)
     state = MOVES["attract"](state)
     before = topology(state, target, grid)
-    for move in ("sweep", "flip", "exchange", "attract", "relabel", "sweep", "exchange", "flip", "repair"):
+    for move in ("sweep", "flip", "exchange", "attract", "sweep", "exchange", "flip", "repair"):
         n_cells = int(state.complex.n_cells[0])
         old = state.complex.cells[:n_cells].copy(), state.complex.labels[:n_cells].copy(), state.complex.ticks.copy()
         state = MOVES[move](state)
@@ -138,7 +132,7 @@ def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
 
 
 def test_energy_falls_with_labels(labelled_state):
-    """Sweeps, flips and labels of cells never raise E, tension and voxels of other labels with it."""
+    """Sweeps and flips never raise E, tension and voxels of other labels with it."""
     state, _, _ = labelled_state("balls")
     state = MOVES["attract"](state)
 
@@ -147,7 +141,7 @@ def test_energy_falls_with_labels(labelled_state):
         return state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
 
     last = E()
-    for move in ("sweep", "flip", "relabel", "sweep", "flip"):
+    for move in ("sweep", "flip", "sweep", "flip"):
         state = MOVES[move](state)
         assert last * (1.0 + 1e-9) >= E(), move
         last = E()

@@ -31,8 +31,7 @@ def solved(points, cells, labels, n_labels=2, components=None, weight=None, coun
     """`labelled` of cells that are full of one label each."""
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
     components = [np.array([1])] * n_labels if components is None else components
-    bias = np.zeros(counts.shape[1])
-    return labelled(points, cells, across_of(cells, len(points)), counts, components, None, bias, weight=weight)
+    return labelled(points, cells, across_of(cells, len(points)), counts, components, None, False, weight=weight)
 
 
 def lattice(n, cubes):

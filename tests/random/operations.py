@@ -18,9 +18,8 @@ from worlds import random_world
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.complex import build, node_stars, remeasure
+from tetopt.engine.complex import build, remeasure
 from tetopt.engine.fast import FAR_TICKS, Run
-from tetopt.engine.interfaces import relabel
 from tetopt.geometry.check import manifold_problems
 from tetopt.start.sizes import Sizes
 
@@ -28,7 +27,7 @@ CHECKED_EVERY = 1000  # operations
 WORLD_OPERATIONS = 10_000  # then another world
 # on the surface of details as small as cells: a run says so (`MeshingResult.violated`)
 OVERLAP = "overlap within a mask"
-KINDS = ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces", "labels")
+KINDS = ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces")
 
 
 def begun(rng):
@@ -53,7 +52,7 @@ def operate(run, rng, made):
     if run.n == 3:
         run.keep_min_dihedral(float(rng.choice([0.0, 3.0, 8.0, 12.0, 20.0])))
     run.hope[:] = np.inf
-    kind = str(rng.choice(KINDS, p=[0.35, 0.25, 0.2, 0.1, 0.05, 0.05]))
+    kind = str(rng.choice(KINDS, p=[0.35, 0.25, 0.2, 0.1, 0.1]))
     before = run.state.complex.ticks.copy()
     if kind == "moves":
         run.sweep()
@@ -68,8 +67,6 @@ def operate(run, rng, made):
     elif kind == "moves to interfaces" and run.has_labels:
         run.attract(float(rng.choice([0.0, 4.0, 12.0])))
         made[kind] += int((run.state.complex.ticks != before).any(axis=1).sum())
-    elif kind == "labels" and run.has_labels:
-        made[kind] += relabel(run.state, node_stars(run.state))
     run.state = run.state._replace(objective=run.state.objective._replace(geometry=objective.geometry))
 
 

@@ -29,9 +29,6 @@ STEPS_PER_SIGMA = 256.0  # least number of integer steps in a contrast's standar
 WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight other than 0
 MOST_TENSION = 10.0  # voxels; details of twice this radius would vanish
 SMOOTH_INTERFACES = 0.3  # voxels, the default tension: details up to twice this radius vanish
-# Fraction of the local edge: facets of nodes exactly on a curved surface would cut it off. 0.1 gives more folds, and no
-# higher Dice.
-BAND_FRACTION = 0.05
 MARGIN_VOXELS = 4  # margin around a mask: the reach of surface smoothing and of cells on the surface
 WRONG_SIDE_VARIANCES = 4.0  # weight of a voxel on the wrong side of the region's surface, in variances
 ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below this limit, so that 32 bits hold them exactly
@@ -62,7 +59,6 @@ class SmoothLabels(NamedTuple):
     own_channel: NDArray[np.int64]  # (K,) channel of each label, a row of `values`
     own_value: NDArray[np.int32]  # (K,) value of its voxels in that channel
     keeps_volumes: bool  # True if labels thinner than cells keep their volume
-    band: float = BAND_FRACTION  # fraction of the local edge that a node may be off the surface between two labels
 
 
 class Content(NamedTuple):
@@ -93,6 +89,9 @@ class Content(NamedTuple):
         The first contrast as given, if `image` is another: a part of it, with other values beyond the mask, or divided.
     repeats : tuple of int
         Number of voxels along each axis that repeat one of the image's file; empty if none does.
+    is_flat : bool
+        Facets stay flat, so that nodes on a surface lie off it by what facets cut off. False for order 2: curved facets
+        cut nothing off, and their corners lie on the surface.
 
     Examples
     --------
@@ -114,6 +113,7 @@ class Content(NamedTuple):
     statistics: Statistics | None = None
     whole: Image | None = None
     repeats: tuple[int, ...] = ()
+    is_flat: bool = True
 
     @property
     def given(self) -> Image:

@@ -38,7 +38,7 @@ from tetopt.system.kernels import (
 
 # A cell's volume over (sum of squared edges)^(n/2), below which it counts as inverted: an angle of 1e-3 degrees.
 FLAT_FRACTION = 1e-7
-NODE_ROWS = ("ticks", "is_frozen", "meeting", "band")  # fields of a `Complex` with one row per node
+NODE_ROWS = ("ticks", "is_frozen", "meeting", "band", "offset")  # fields of a `Complex` with one row per node
 CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # fields of a `Complex` with one row per cell
 
 
@@ -48,7 +48,8 @@ class Complex(NamedTuple):
     ticks: Ints2  # (N, 3) node positions on the sampling grid
     is_frozen: Bools2  # (N, 4) axes along which each node is fixed; last column: on the mask's surface
     meeting: Ints2  # (N, 4) labels of the cells around each node if there are two or more; else -1
-    band: Floats1  # (N,) distance that each node may be off the surface between two labels, voxels
+    band: Floats1  # (N,) distance that each node may be off its place at the surface between two labels, voxels
+    offset: Floats1  # (N,) value of each node's first constraint at its place; see `surface.fill_offsets`
     cells: Ints2  # (C, n+1) corners, positively oriented in the world
     labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 until labels are assigned
     across: Ints2  # (C, n+1) the cell beyond each facet; -1 outside
@@ -78,8 +79,6 @@ class Objective(NamedTuple):
     n_means: int  # leading channels for which a cell has its mean; in the others its label sets the value
     own_column: Ints1  # (K,) column of a cell's sums for each label's channel
     own_value: Floats1  # (K,) the label's value there; 0 in the other channels of labels
-    bias: Floats1  # (K,) bonus of a label, as a fraction of a cell's voxels; see `tetopt.engine.labelling`
-    shift: Floats1  # (K,) outward shift of each label's surface, in its level, voxels; see `tetopt.engine.interfaces`
     tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 
@@ -119,6 +118,7 @@ def build(
         ticks,
         is_frozen,
         np.full((len(ticks), 4), -1, dtype=np.int64),
+        np.zeros(len(ticks)),
         np.zeros(len(ticks)),
         np.full((room, n_corners), -1, dtype=np.int64),
         np.zeros(room, dtype=np.int64),

@@ -189,8 +189,8 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
     is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
     meeting = np.concatenate([state.complex.meeting, np.full((n_nodes, 4), -1, dtype=np.int64)])
-    band = np.concatenate([state.complex.band, np.zeros(n_nodes)])
-    complex_ = state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting, band=band)
+    band, offset = (np.concatenate([rows, np.zeros(n_nodes)]) for rows in (state.complex.band, state.complex.offset))
+    complex_ = state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting, band=band, offset=offset)
     return state._replace(complex=complex_)
 
 

@@ -24,7 +24,7 @@ from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import NodeStars, State, copied, interface_energy, node_stars, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.interfaces import mend_pinches, relabel, with_balance, with_labels
+from tetopt.engine.interfaces import mend_pinches, with_labels
 from tetopt.engine.labelling import LabelVoxels, label_voxels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
@@ -45,6 +45,7 @@ from tetopt.engine.repair import cell_cosines, n_cells_below, repair
 from tetopt.engine.requirements import checked
 from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
+from tetopt.engine.surface import fill_offsets
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import regular_edge, volumes
 from tetopt.image import Image, transformed
@@ -55,6 +56,8 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.kernels import link, roots
 
+BAND_FRACTION = 0.1  # of the edge: distance that a node may be off its place at the surface between two labels
+MOST_OFFSET_FRACTION = 0.15  # of the edge: most that a node's place is off the surface
 FLIP_EDGES = 0.05  # of an edge: nodes that moved less need no new flips
 HOPE_FRACTION = 0.003  # of E over the number of nodes: least expected gain of a move
 EARLY_HOPE_FRACTION = 0.05  # the same while nodes are exchanged, as cells around them change anyway
@@ -234,7 +237,7 @@ def followed(
         if is_labelled:
             run.give_labels()
         stars = None
-        if run.has_labels:
+        if run.has_labels or run.state.sides.has_surface:
             degrees = min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral
             stars = run.attract(degrees)
         # 1. Move the nodes.
@@ -432,30 +435,24 @@ class Run:
         self.ticks_flipped[:] = FAR_TICKS
 
     def attract(self, degrees: float) -> NodeStars:
-        """Let cells take other labels where that lowers E, and move nodes between labels onto their interfaces.
+        """Move nodes between labels, and those of a mask's surface, to their places there.
 
         No angle falls below `degrees`; within a mask, where `lift` may be undone, none falls below the minimum. Returns
         the stars, whose cells do not change.
         """
-        ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
-        self.state = with_balance(self.state, self.content, self.mesh())
+        ticks = self.state.complex.ticks.copy()
         stars = node_stars(self.state)
-        relabel(self.state, stars)
-        self._set_band()
+        if self.content.is_flat:
+            edge = self.edge / self.image.voxel_volume ** (1.0 / self.n)
+            self.state.complex.band[:] = BAND_FRACTION * edge
+            fill_offsets(self.state, MOST_OFFSET_FRACTION * edge)
         lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:
             lowest = max(lowest, self.state.objective.angle_limit)
         attract(self.state, stars, self.groups, lowest)
         is_other = (self.state.complex.ticks != ticks).any(axis=1)[self.cells].any(axis=1)
-        is_other |= (self.state.complex.labels != labels)[: self.n_cells]
         self.hope[self.cells[is_other]] = np.inf
         return stars
-
-    def _set_band(self) -> None:
-        """Set the distance that nodes may be off the surface between two labels."""
-        assert self.content.smooth is not None
-        step = self.image.voxel_volume ** (1.0 / self.n)
-        self.state.complex.band[:] = self.content.smooth.band * self.edge / step
 
     def keep_min_dihedral(self, degrees: float) -> None:
         """Forbid moves that leave a dihedral angle below `degrees`, or lower one that is below it already."""

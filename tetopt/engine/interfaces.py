@@ -1,8 +1,6 @@
 """Interfaces between labels: their cells, their sliding nodes, and their part of E.
 
-The initial label of a cell follows from its voxels, tension and topology (`tetopt.engine.labelling`). From then on
-labels change only with the mesh: cells next to an interface take the label of a neighbour if that lowers E and
-preserves both labels' topology.
+The label of a cell follows from its voxels, tension and topology (`tetopt.engine.labelling`).
 """
 
 from __future__ import annotations
@@ -18,27 +16,20 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.complex import NodeStars, State, facet_area, image_energy, node_stars, outward, pair_tension
-from tetopt.engine.labelling import Contacts, LabelVoxels, balanced, keeps_topology, label_voxels, labelled, unpinched
+from tetopt.engine.complex import NodeStars, State, node_stars
+from tetopt.engine.labelling import Contacts, LabelVoxels, label_voxels, labelled, unpinched
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
-from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
+from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
-from tetopt.system.kernels import Bools1, Floats1, Ints1, entry, helper, unit
+from tetopt.system.kernels import entry, unit
 
 FEWEST_CENTRES = 20  # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
 SAMPLED_FRACTION = 0.5  # of a label's voxels: if samples show less, its centres are counted, too
 SAMPLED_AT_ONCE = 20_000  # cells per thread
-BALANCE_LEAK = 0.8  # fraction of its bias that a label keeps if its volume is right, except for
-SMALL_LOSS_FRACTION = 0.04  # of the volume: facets always cut it off round shapes, which would raise the bias forever
-SPARED_LOSS_FRACTION = 0.08  # of a label's volume that is not restored: restoring all of it would cost position (Dice)
-SHIFT_STEP = 0.5  # fraction of the shift that would restore the volume
-MOST_SHIFT_FRACTION = 0.2  # largest shift, of the edge next to a label's surface
-RELABELLING_PASSES = 10  # at most; the third usually changes nothing
-LEAST_RELABELLING_FRACTION = 1e-9  # of the energies compared: a smaller gain may be rounding
 
 
 def with_labels(
@@ -46,71 +37,26 @@ def with_labels(
 ) -> State:
     """The state with one of the content's labels for each cell, and an objective that penalises other labels' voxels.
 
-    `voxels` is the information on the labels' voxels (`label_voxels`), if known. If cells already have labels, each
-    label's bias is updated for the volume that it has lost or gained.
+    `voxels` is the information on the labels' voxels (`label_voxels`), if known.
     """
-    members, tension, own_channel, own_value, keeps_volumes, _ = smooth
-    bias = None if keeps_volumes else np.zeros(len(members.labels))
+    members, tension, own_channel, own_value, keeps_volumes = smooth
     voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels))
-    if len(state.objective.bias) > 0:
-        state = with_balance(state, content, mesh)
-        bias = state.objective.bias
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     counts, contacts = cell_contents(image, members, mesh, voxels)
-    made = labelled(mesh.points, mesh.cells, across, counts, voxels.components, contacts, bias)
+    made = labelled(mesh.points, mesh.cells, across, counts, voxels.components, contacts, keeps_volumes)
     state.complex.labels[:n_cells] = made.labels
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
-        bias=made.bias,
-        shift=state.objective.shift if len(state.objective.shift) > 0 else np.zeros(len(made.bias)),
         tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
     state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
     _meet_everywhere(state, node_stars(state))
     return state
-
-
-def with_balance(state: State, content: Content, mesh: Mesh) -> State:
-    """The state with a higher bias for labels whose cells have less volume than their voxels, if volumes are preserved.
-
-    Cells cannot restore the volume that nodes on a round surface cut off. A shift of the label's level therefore moves
-    its surface outwards, or inwards if the label has far too much volume.
-    """
-    if content.smooth is None or not content.smooth.keeps_volumes:
-        return state
-    members = content.smooth.memberships
-    rows = members.partition if content.inside is None else members.partition[content.inside]
-    aim = content.image.voxel_volume * np.bincount(rows.ravel(), minlength=len(members.labels))
-    size = np.abs(volumes(mesh.points, mesh.cells))
-    volume = np.bincount(state.complex.labels[: len(size)], size, len(members.labels))
-    is_small = np.abs(volume - aim) < SMALL_LOSS_FRACTION * aim
-    bias = balanced(np.where(is_small, BALANCE_LEAK, 1.0) * state.objective.bias, aim, volume)
-    shift = state.objective.shift
-    if content.smooth.band > 0.0:
-        spared = np.sign(aim - volume) * np.maximum(np.abs(aim - volume) - SPARED_LOSS_FRACTION * aim, 0.0)
-        shift = _shifted(shift, spared, state, mesh, content.image.voxel_volume ** (1.0 / content.image.ndim))
-    return state._replace(objective=state.objective._replace(bias=bias, shift=shift))
-
-
-def _shifted(
-    shift: NDArray[np.float64], missing: NDArray[np.float64], state: State, mesh: Mesh, step: float
-) -> NDArray[np.float64]:
-    """Outward shifts of labels' surfaces, (K,) voxels of `step` mm, that give labels their missing volume, mm^n."""
-    labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
-    is_between = (across >= 0) & (labels[across] != labels[:, None])
-    beside, n = np.flatnonzero(is_between.any(axis=1)), mesh.points.shape[1]
-    label, cells, n_labels = labels[beside], mesh.cells[beside], len(shift)
-    area = np.bincount(label, (facet_areas(mesh.points, cells) * is_between[beside]).sum(axis=1), n_labels)
-    number = np.maximum(np.bincount(label, minlength=n_labels), 1)
-    size = np.bincount(label, np.abs(volumes(mesh.points, cells)), n_labels) / number
-    most = MOST_SHIFT_FRACTION * regular_edge(size, n) / step
-    way = SHIFT_STEP * missing / np.where(area > 0.0, area * step, np.inf)
-    return np.asarray(np.clip(shift + way, -most, most))
 
 
 def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> None:
@@ -254,73 +200,3 @@ def _meet(state: State, stars: NodeStars, node: int) -> None:
 def _meet_everywhere(state: State, stars: NodeStars) -> None:
     for node in range(len(state.complex.ticks)):
         _meet(state, stars, node)
-
-
-def relabel(state: State, stars: NodeStars) -> int:
-    """Let cells next to an interface take a neighbour's label if E falls and no topology changes; return the number."""
-    n_cells, total = int(state.complex.n_cells[0]), 0
-    gain, label, is_stale = np.zeros(n_cells), np.zeros(n_cells, dtype=np.int64), np.ones(n_cells, dtype=bool)
-    for _ in range(RELABELLING_PASSES):
-        # After the first pass only changed cells and their neighbours, in a sixth of the time of all cells.
-        _find_relabellings(gain, label, state, np.flatnonzero(is_stale))
-        is_stale[:] = False
-        order = np.flatnonzero(gain > 0.0)
-        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, is_stale, state, stars)
-        total += moved
-        if moved == 0:
-            break
-    return total
-
-
-@unit
-def _price(state: State, cell: int, label: int) -> float:
-    """The part of E that depends on a cell's label."""
-    mesh, objective = state.complex, state.objective
-    price = objective.image * image_energy(mesh.sums, cell, label, objective)
-    for k in range(mesh.cells.shape[1]):
-        other = mesh.across[cell, k]
-        if other >= 0 and mesh.labels[other] != label:
-            a, b, c = outward(mesh.cells, cell, k)
-            price += pair_tension(objective, label, mesh.labels[other]) * facet_area(mesh.ticks, a, b, c, objective)
-    return price
-
-
-@helper
-def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) -> None:
-    mesh = state.complex
-    gain[cell], label[cell], own = 0.0, mesh.labels[cell], -1.0
-    for k in range(mesh.cells.shape[1]):
-        other = mesh.across[cell, k]
-        if other < 0 or mesh.labels[other] == mesh.labels[cell]:
-            continue
-        if own < 0.0:
-            own = _price(state, cell, mesh.labels[cell])
-        objective, new, old = state.objective, mesh.labels[other], mesh.labels[cell]
-        squares = objective.own_value[new] ** 2 + objective.own_value[old] ** 2
-        favour = (objective.bias[new] - objective.bias[old]) * squares * objective.image * mesh.sums[cell, 0]
-        more = own - _price(state, cell, new) + favour
-        if more > max(gain[cell], LEAST_RELABELLING_FRACTION * own):
-            gain[cell], label[cell] = more, mesh.labels[other]
-
-
-@entry
-def _find_relabellings(gain: Floats1, label: Ints1, state: State, stale: Ints1) -> None:
-    for cell in stale:
-        _find_relabelling(gain, label, state, cell)
-
-
-@entry
-def _relabel(order: Ints1, gain: Floats1, label: Ints1, is_stale: Bools1, state: State, stars: NodeStars) -> int:
-    mesh, moved = state.complex, 0
-    for cell in order:
-        _find_relabelling(gain, label, state, cell)
-        if gain[cell] > 0.0 and keeps_topology(
-            mesh.cells, mesh.across, mesh.labels, stars.start, stars.cells, cell, label[cell]
-        ):
-            mesh.labels[cell], is_stale[cell] = label[cell], True
-            for k in range(mesh.cells.shape[1]):
-                _meet(state, stars, mesh.cells[cell, k])
-                if mesh.across[cell, k] >= 0:
-                    is_stale[mesh.across[cell, k]] = True
-            moved += 1
-    return moved

@@ -32,9 +32,7 @@ from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
-TENSION_FRACTION = (
-    0.1  # of the local edge: a regular cell with three facets to one label takes it, unless nearly full of its own
-)
+TENSION_FRACTION = 0.05  # of the local edge; with 0.1, a cortex of a cell's thickness lost a fifth of its area
 LEAST_FRACTION = 0.5  # of a label's volume that tension must leave, so that small labels do not vanish
 LAST_FRACTION = 0.1  # of that, which mending must leave: it may finally take more, rather than leave a pinch
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
@@ -47,15 +45,10 @@ APART_TENSION = 10.0  # times the usual, between labels that are separate in the
 PLACE_TENSION = 3.0  # the same, at places where they touch
 APART_WEIGHT = 10.0  # where such labels meet only at a node or an edge: a sheet between them is pierced
 LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs with less contact touch only at places
-BALANCE_ROUNDS = 10  # of labelling and balancing, if no bias is known; more hardly change it
-BALANCE_STEP = 3.0  # rise of a label's bias, times the fraction of its volume that it lacks,
-LONGEST_BALANCE_STEP = 0.1  # at most,
-FIRST_BALANCE_STEP = 0.2  # and in a single assignment of labels
-# largest loss and gain of a label's volume when labels are reassigned with the bias that compensated for losses since:
-# in cells much larger than a label's thickness, such a bias gives or takes several times its volume
-MOST_SWING = (0.15, 0.4)
-SWING_ROUNDS = 4  # of reassigning them, at most
-MOST_BIAS = 0.9  # of a cell's volume: a label with less than a twentieth of a cell does not get it
+BALANCE_ROUNDS = 10  # of labelling and balancing; more hardly change it
+FIRST_BALANCE_STEP = 0.2  # longest change of a bias in one of them, at first
+BIAS_PER_LOSS = 3.0  # bias of a label over the fraction of its volume that it lacks, in cells labelled so far
+MOST_BIAS = 0.4  # of a cell's volume: a label with less than three tenths of a cell does not get it
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 
@@ -84,7 +77,6 @@ class Labelling(NamedTuple):
     n_nonmanifold_nodes: int
     components: NDArray[np.int64]  # (K,) number of components of cells, linked by facets
     lost: NDArray[np.int64]  # labels with voxels but without cells
-    bias: NDArray[np.float64]  # (K,) bias of labels that led to them
 
 
 class Dual(NamedTuple):
@@ -106,7 +98,7 @@ class Dual(NamedTuple):
 
 def labelled(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
-    components: list[NDArray], contacts: Contacts | None = None, bias: NDArray[np.float64] | None = None,
+    components: list[NDArray], contacts: Contacts | None = None, keeps_volumes: bool = True,
     weight: float | None = None,
 ) -> Labelling:  # fmt: skip
     """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without fragments.
@@ -128,10 +120,9 @@ def labelled(
         Voxels in each component of each label, descending: `voxel_components`. As many components of cells may stay.
     contacts : Contacts, optional
         Labels that are separate in the voxels; none by default.
-    bias : (K,) float64, optional
-        Bonus of each label, as a fraction of a cell's volume. By default it preserves the labels' volumes as far as
-        possible: a label that is thinner than cells has most of the voxels in few of them. A given bias is kept, unless
-        labels would get far more or far less than their volumes (`MOST_SWING`).
+    keeps_volumes : bool
+        Give a bonus to labels that lack volume: a label that is thinner than cells has most of the voxels in few of
+        them. The bonus is in proportion to the loss, so that the overlap that it costs is bounded (`MOST_BIAS`).
     weight : float, optional
         Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
@@ -144,11 +135,9 @@ def labelled(
     aim = np.bincount(dual.row, dual.volume, n_labels).astype(np.float64)
     least = LEAST_FRACTION * aim
     begin = _majority(dual)
-    dual.bias[:] = _balance(dual, aim, least) if bias is None else bias
-    if bias is not None and bias.any():
-        labels = _without_swing(dual, aim, least, voxel, components)
-    else:
-        labels = _given(dual, least, voxel, components)
+    if keeps_volumes:
+        _balance(dual, aim, least)
+    labels = _given(dual, least, voxel, components)
     faces, is_two = _nonmanifold(dual, labels)
     _, of_component = components_of(across, labels)
     return Labelling(
@@ -158,7 +147,6 @@ def labelled(
         int((is_two & (faces[:, 1] < 0)).sum()),
         np.bincount(of_component, minlength=n_labels),
         np.flatnonzero((aim > 0.0) & (np.bincount(labels, minlength=n_labels) == 0)),
-        dual.bias,
     )
 
 
@@ -187,28 +175,6 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
     return labels
 
 
-def _without_swing(
-    dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64], voxel: float, components: list[NDArray]
-) -> NDArray[np.int64]:
-    """Labels, (M,), with as little volume as possible beyond `MOST_SWING` of `aim`; updates the dual's bias.
-
-    The bias that compensated for the labels' losses since their assignment may be far too strong for a new one.
-    """
-    fewest = np.inf
-    for _ in range(1 + SWING_ROUNDS):
-        labels = _given(dual, least, voxel, components)
-        volume = np.bincount(labels, dual.size, len(aim))
-        near = np.clip(volume, (1.0 - MOST_SWING[0]) * aim, (1.0 + MOST_SWING[1]) * aim)
-        beyond = float(np.abs(volume - near).sum())
-        if beyond < fewest:
-            best, bias, fewest = labels, dual.bias.copy(), beyond
-        if beyond == 0.0:
-            break
-        dual.bias[:] = balanced(dual.bias, near, volume, FIRST_BALANCE_STEP)
-    dual.bias[:] = bias
-    return best
-
-
 def unpinched(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     contacts: Contacts | None, labels: NDArray[np.int64],
@@ -235,26 +201,20 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
             labels[best] = label
 
 
-def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Find the bias that gives labels nearly their volumes `aim`; steps are halved if they go too far."""
+def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
+    """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that its cells lack.
+
+    Steps towards it are halved if they go too far.
+    """
     longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
         _settle(dual, labels, least, False)
-        step = balanced(dual.bias, aim, np.bincount(labels, dual.size, len(aim)), longest) - dual.bias
-        longest = np.where(step * before < 0.0, 0.5 * longest, longest)
-        before = np.clip(step, -longest, longest)
+        loss = 1.0 - np.bincount(labels, dual.size, len(aim)) / np.where(aim > 0.0, aim, np.inf)
+        bias = np.where(aim > 0.0, np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), 0.0)
+        longest = np.where((bias - dual.bias) * before < 0.0, 0.5 * longest, longest)
+        before = np.clip(bias - dual.bias, -longest, longest)
         dual.bias[:] += before
-    return dual.bias
-
-
-def balanced(
-    bias: NDArray[np.float64], aim: NDArray, volume: NDArray, longest: NDArray | float = LONGEST_BALANCE_STEP
-) -> NDArray[np.float64]:
-    """The bias of each label, raised if its volume is below its aim, lowered if it is above; all (K,)."""
-    missing = np.where(aim > 0.0, 1.0 - volume / np.where(aim > 0.0, aim, 1.0), 0.0)
-    step = np.clip(BALANCE_STEP * missing, -longest, longest)
-    return np.asarray(np.clip(bias + step, -MOST_BIAS, MOST_BIAS))
 
 
 def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
@@ -685,10 +645,13 @@ def _mend_near(
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
     """Mend the remaining places between two labels, even if that removes a bridge."""
-    faces, is_two = _nonmanifold(dual, labels)
-    room = np.bincount(labels, dual.size, len(least)) - least
     is_bridge, marks = np.zeros(len(labels), dtype=bool), np.zeros((3, len(dual.scale)), dtype=bool)
-    _mend(dual, labels, room, is_bridge, faces[is_two], *marks, _work(dual))
+    for _ in range(MENDING_ROUNDS):
+        faces, is_two = _nonmanifold(dual, labels)
+        before, room = labels.copy(), np.bincount(labels, dual.size, len(least)) - least
+        _mend(dual, labels, room, is_bridge, faces[is_two], *marks, _work(dual))
+        if np.array_equal(before, labels):
+            break
 
 
 @entry

@@ -236,9 +236,7 @@ class MeshSearch:
         self._options = _with_defaults(mode, options)
         if mode == "graded":
             aim = aim._replace(sizes=sizes_of_order(content, aim.nodes, aim.sizes, aim.order))
-        if aim.order == 2 and content.smooth is not None:  # curved edges cut nothing off: corners on the surface, too
-            content = content._replace(smooth=content.smooth._replace(band=0.0))
-        self._content, self._aim = content, aim
+        self._content, self._aim = content._replace(is_flat=content.is_flat and aim.order == 1), aim
 
     def __iter__(self) -> Iterator[Attempt]:
         """Yield the attempts, each once the result of the last one is told."""

@@ -749,20 +749,20 @@ def slid(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
     return is_there and (not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1))
 
 
-# Move nodes between labels onto the surface on which they will slide.
+# Move nodes of a mask's surface, or between labels, to their places there, where they will slide.
 
 
 def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) -> None:
-    """Move nodes between labels onto their interfaces, or as far as no cell becomes flatter than `angle_limit`.
+    """Move nodes to their places at surfaces, or as far as no cell becomes flatter than `angle_limit`.
 
     A cell that is flatter already may not get worse. E may rise. `angle_limit` is minus a cosine, as in `Objective`.
     """
     lowered = state._replace(objective=state.objective._replace(angle_limit=angle_limit))
-    is_between = state.complex.meeting[:, 1] >= 0
+    is_beside = (state.complex.meeting[:, 1] >= 0) | state.complex.is_frozen[:, 3]
     laid_out = packed(lowered), packed(stars), packed(groups)
     for chosen in colours_of(state, stars, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
-            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_between, np.zeros(0)))
+            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_beside, np.zeros(0)))
 
 
 @unit
@@ -795,7 +795,8 @@ def _approach(node: int, state: State, stars: NodeStars) -> None:
                 here[2] + np.int64(np.rint(fraction * way[2])),
             ),
         )  # fmt: skip
-        if star_energy(trial, np.inf, least, node, state, stars, -1) < np.inf:
+        is_free = not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1)
+        if is_free and star_energy(trial, np.inf, least, node, state, stars, -1) < np.inf:
             store(trial, node, state, stars)
             return
         fraction *= 0.5

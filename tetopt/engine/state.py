@@ -138,8 +138,6 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
         n_means=int(grid.n_channels),
         own_column=np.zeros(0, dtype=np.int64),
         own_value=np.zeros(0),
-        bias=np.zeros(0),
-        shift=np.zeros(0),
         tension=0.0,
     )
 

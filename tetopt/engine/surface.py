@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import ON_SURFACE_VOXELS
-from tetopt.engine.complex import NodeStars, State, has_node, outward, place
+from tetopt.engine.complex import NodeStars, State, facet_area, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
-from tetopt.system.kernels import Floats2, Singles3, entry, helper, unit
+from tetopt.system.kernels import Floats1, Floats2, Singles3, entry, helper, unit
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place whose levels are this close to 0 lies on all of them
 CURVE_STEP_VOXELS = 0.7  # longest step towards such a place, where levels bend
@@ -123,8 +123,8 @@ def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float)
 @unit
 def constraint_values(normal: Floats2, state: State, node: int) -> int:
     """Write the values of a node's constraints to normal[6, :3]; return their number."""
-    ticks, meeting, objective, count = state.complex.ticks, state.complex.meeting, state.objective, 0
-    scale = 2.0**-objective.bits
+    ticks, meeting, count = state.complex.ticks, state.complex.meeting, 0
+    scale = 2.0**-state.objective.bits
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
     if state.complex.is_frozen[node, 3]:
         normal[6, 0] = level_at(state.sides.level, i, j, k)
@@ -132,9 +132,9 @@ def constraint_values(normal: Floats2, state: State, node: int) -> int:
     for m in range(1, MOST_MEETING):
         if meeting[node, m] >= 0 and count < 3:
             one, other = _label_levels(state, node, m)
-            shift = objective.shift[meeting[node, m]] - objective.shift[meeting[node, 0]]
-            normal[6, count] = level_at(one, i, j, k) - level_at(other, i, j, k) + shift
+            normal[6, count] = level_at(one, i, j, k) - level_at(other, i, j, k)
             count += 1
+    normal[6, 0] -= state.complex.offset[node]
     return count
 
 
@@ -267,3 +267,96 @@ def _put_in_box(state: State, node: int) -> None:
     ticks, sides = state.complex.ticks, state.sides
     for d in range(3):
         ticks[node, d] = min(max(ticks[node, d], sides.low[d]), sides.high[d])
+
+
+# A flat facet with its corners on a round surface cuts off what lies beyond it: nodes off the surface make up for it.
+
+
+def _facet_places(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Barycentric places (S, n) on a facet of n corners; weights (S, 2) of a mean over the facet and at its corners.
+
+    Exact for quadratic functions: Simpson's rule on an edge, the middles of edges of a triangle's four parts.
+    """
+    corners = np.eye(n)
+    if n == 2:
+        return np.vstack([[0.5, 0.5], corners]), np.array([[4.0, 0.0], [1.0, 3.0], [1.0, 3.0]]) / 6.0
+    middles = 0.5 * (corners + np.roll(corners, 1, axis=0))
+    parts = [middles, *(0.5 * (corners + corner) for corner in corners)]
+    places = np.vstack([*(middles @ part for part in parts), corners])
+    return places, np.repeat([[1.0 / 12.0, 0.0], [0.0, 1.0 / 3.0]], [12, 3], axis=0)
+
+
+def fill_offsets(state: State, most: NDArray[np.float64]) -> None:
+    """Set the values of nodes' first constraints at which facets cut off as much of a round surface as they add.
+
+    The mean of a level over a facet minus that at its corners is what the facet cuts off: h^2 / 8R on a sphere of
+    radius R, for an equilateral facet with edge h. A node's offset is minus the mean over the facets around it, of the
+    mask's surface or between two labels, up to `most` (N,), in voxels; 0 where more labels meet. Nodes that lie within
+    a band, and not in its middle, move the band until the level's mean over their facets is 0.
+    """
+    room = np.zeros((3, len(most)))
+    _fill_offsets(state, most, room, *_facet_places(state.complex.cells.shape[1] - 1))
+
+
+@entry
+def _fill_offsets(state: State, most: Floats1, room: Floats2, places: Floats2, weights: Floats2) -> None:
+    mesh, n = state.complex, state.complex.cells.shape[1]
+    area, mean, at_corners, corners = room[0], room[1], room[2], np.empty(3, dtype=np.int64)
+    for cell in range(mesh.n_cells[0]):
+        for k in range(n):
+            other = mesh.across[cell, k]
+            is_between = other > cell and mesh.labels[other] != mesh.labels[cell]
+            corners[0], corners[1], corners[2] = outward(mesh.cells, cell, k)
+            if not (is_between or (other < 0 and _is_on_mask(state, corners[: n - 1]))):
+                continue
+            whole, ends = _facet_means(state, cell, other, corners[: n - 1], places, weights)
+            size = facet_area(mesh.ticks, corners[0], corners[1], corners[2], state.objective)
+            for node in corners[: n - 1]:
+                if mesh.is_frozen[node, 3] == (other < 0) and (other < 0 or mesh.meeting[node, 2] < 0):
+                    area[node] += size
+                    mean[node] += size * whole
+                    at_corners[node] += size * ends
+    for node in range(len(most)):
+        if not area[node] > 0.0:
+            mesh.offset[node] = 0.0
+            continue
+        limit = most[node] if mesh.is_frozen[node, 3] else LEVELS_RISE * most[node]
+        middle = min(max((at_corners[node] - mean[node]) / area[node], -limit), limit)
+        moved, band = mesh.offset[node] - mean[node] / area[node], band_of(state, node)
+        mesh.offset[node] = min(max(moved, middle - band), middle + band)
+
+
+@helper
+def _is_on_mask(state: State, corners: NDArray) -> bool:
+    """True if a facet's corners lie on the mask's surface, and the facet on no side of the box."""
+    is_on = state.sides.has_surface
+    for node in corners:
+        is_on = is_on and state.complex.is_frozen[node, 3]
+    for d in range(3):
+        at, is_flat = state.complex.ticks[corners[0], d], len(corners) == 3 or d > 0
+        for node in corners:
+            is_flat = is_flat and state.complex.ticks[node, d] == at
+        is_on = is_on and not (is_flat and (at == state.sides.low[d] or at == state.sides.high[d]))
+    return is_on
+
+
+@helper
+def _facet_means(state: State, cell: int, other: int, corners: NDArray, places: NDArray, weights: NDArray) -> tuple:
+    """The mean of a facet's constraint over the facet, and its mean at the corners."""
+    ticks, scale, whole, ends = state.complex.ticks, 2.0**-state.objective.bits, 0.0, 0.0
+    for s in range(len(weights)):
+        i, j, k = 0.0, 0.0, 0.0
+        for m in range(len(corners)):
+            i += places[s, m] * scale * ticks[corners[m], 0]
+            j += places[s, m] * scale * ticks[corners[m], 1]
+            k += places[s, m] * scale * ticks[corners[m], 2]
+        if other < 0:
+            value = level_at(state.sides.level, i, j, k)
+        else:
+            low = min(state.complex.labels[cell], state.complex.labels[other])
+            high = max(state.complex.labels[cell], state.complex.labels[other])
+            channel, levels = state.sides.channel, state.sides.levels
+            value = level_at(levels[channel[low]], i, j, k) - level_at(levels[channel[high]], i, j, k)
+        whole += weights[s, 0] * value
+        ends += weights[s, 1] * value
+    return whole, ends
