@@ -506,8 +506,8 @@ def volume_missing(level, inside, add_volume):
     return result
 
 
-def smooth_level(inside, settles=False):
-    """The level of a label on voxels that are nearly cubes, or of a mask, which settles."""
+def smooth_level(inside):
+    """The level of a label on voxels that are nearly cubes, or of a mask."""
     distance = distances_across(inside)
     sign = np.where(inside, -1.0, 1.0)
     size = distance - 0.5
@@ -521,9 +521,8 @@ def smooth_level(inside, settles=False):
         smooth = fine + fraction * (broad - fine)
         smooth = smooth - volume_missing(smooth, inside, volume_by_voxels)
         level = sign * np.clip(sign * smooth, least, most)
-    if settles:
-        level = level - volume_missing(level, inside, volume_between_centres)
-        level = sign * np.clip(sign * level, least, most)
+    level = level - volume_missing(level, inside, volume_between_centres)
+    level = sign * np.clip(sign * level, least, most)
     return np.clip(level, -6.0, 6.0)
 
 

@@ -13,7 +13,6 @@ from tetopt.contents.memberships import (
     finer_affine,
     memberships,
     near_distance,
-    smooth_level,
     supersampling,
 )
 
@@ -75,9 +74,6 @@ def test_a_level_as_by_its_plain_twin(shape):
     inside[14, 2], inside[3, 1] = True, False
     members = memberships(tetopt.Image(1.0 * inside))
     np.testing.assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
-    level = smooth_level(inside, inside, np.zeros(shape, dtype=np.float32), (1,), settles=True)
-    np.testing.assert_allclose(level, naive.smooth_level(inside, settles=True), atol=2e-5)
-    assert np.abs(level - members.levels[members.channel[1]]).max() > 1e-3
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9), (3, 40, 2), (1, 7, 30)])
@@ -97,7 +93,7 @@ def test_a_sphere_has_no_stairs(radius):
     labels = np.where(distance((44, 44, 44), *centre) < radius, 7.0, 2.0)
     level = between(memberships(tetopt.Image(labels)), 7, 2)
     off = crossings(level, centre + radius * way, way, np.linspace(-0.95, 0.95, 191))
-    assert np.abs(off).mean() < 0.07
+    assert np.abs(off).mean() < 0.075
     assert np.quantile(np.abs(off), 0.95) < 0.2
     assert np.abs(off).max() < 0.3
     assert abs(off.mean()) < 0.06

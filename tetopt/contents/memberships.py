@@ -226,7 +226,6 @@ def smooth_level(
     raw: NDArray[np.bool_],
     off: NDArray[np.float32],
     factors: Sequence[int],
-    settles: bool = False,
 ) -> NDArray[np.float32]:
     """The smooth level of a label or a mask, (*shape) float32, clipped at `FARTHEST_LEVEL`.
 
@@ -244,8 +243,6 @@ def smooth_level(
         Distance of each voxel from the plane of a slice, voxels; 0 between slices with the same label.
     factors : sequence of int
         Thickness of a slice along each axis, voxels.
-    settles : bool
-        Correct volumes once more, between voxel centres: without it, walls of two voxels are 2 % too thick.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
@@ -260,7 +257,7 @@ def smooth_level(
         if fraction.any():
             smooth += fraction * (_flowed(level, BROAD_SIGMA) - smooth)
         level = _with_volume(smooth, raw, max(VOLUME_SIGMA, *factors), low, high)
-    if settles:
+    if max(factors) == 1:  # once more, between voxel centres: walls of two voxels would be 2 % too thick
         level = _with_volume(level, raw, max(VOLUME_SIGMA, *factors), low, high, is_exact=True)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 

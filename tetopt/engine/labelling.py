@@ -8,11 +8,12 @@ The labels minimise a Potts energy on the dual graph of a fixed mesh (Boykov, Ve
 
 where the tension, in mm, is the distance that a surface would move to reduce its area. A ball with a radius below three
 tensions, or a sheet thinner than two, costs more than it gains. A label that is thinner than cells has most of the
-voxels in few of them: its bias, one number, is raised until its cells have its volume. The tension is higher between
-labels that touch nowhere in the voxels, or only at a few places: cells between them get the label of the sheet that
-separates them, which would tear otherwise. Starting from the label of most voxels in each cell, cells take the label of
-a neighbour, the best move first, as long as the energy falls. Then components of cells that no component of voxels
-justifies go to their neighbours, and places that are not manifold are mended by the cheapest cells around them.
+voxels in few of them: its bias, one number, is in proportion to the volume that its cells lack, up to a bound. The
+tension is higher between labels that touch nowhere in the voxels, or only at a few places: cells between them get the
+label of the sheet that separates them, which would tear otherwise. Starting from the label of most voxels in each
+cell, cells take the label of a neighbour, the best move first, as long as the energy falls. Then components of cells
+that no component of voxels justifies go to their neighbours, and places that are not manifold are mended by the
+cheapest cells around them.
 
 An interface is manifold at an edge or a node if, for each label there, its cells around it form one fan, and all other
 cells including the outside form one fan, too: linked by facets that contain the edge or the node.
@@ -204,17 +205,22 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
 def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
     """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that its cells lack.
 
-    Steps towards it are halved if they go too far.
+    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes is kept.
     """
-    longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
+    longest, before, least_wrong, best = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim)), np.inf, dual.bias
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
         _settle(dual, labels, least, False)
-        loss = 1.0 - np.bincount(labels, dual.size, len(aim)) / np.where(aim > 0.0, aim, np.inf)
+        volume = np.bincount(labels, dual.size, len(aim))
+        wrong = float(np.abs(volume - aim).sum())
+        if wrong < least_wrong:
+            least_wrong, best = wrong, dual.bias.copy()
+        loss = 1.0 - volume / np.where(aim > 0.0, aim, np.inf)
         bias = np.where(aim > 0.0, np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), 0.0)
         longest = np.where((bias - dual.bias) * before < 0.0, 0.5 * longest, longest)
         before = np.clip(bias - dual.bias, -longest, longest)
         dual.bias[:] += before
+    dual.bias[:] = best
 
 
 def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
