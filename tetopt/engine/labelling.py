@@ -48,8 +48,10 @@ APART_WEIGHT = 10.0  # where such labels meet only at a node or an edge: a sheet
 LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs with less contact touch only at places
 BALANCE_ROUNDS = 10  # of labelling and balancing; more hardly change it
 FIRST_BALANCE_STEP = 0.2  # longest change of a bias in one of them, at first
-BIAS_PER_LOSS = 3.0  # bias of a label over the fraction of its volume that it lacks, in cells labelled so far
-MOST_BIAS = 0.4  # of a cell's volume: a label with less than three tenths of a cell does not get it
+BIAS_PER_LOSS = 3.0  # bias of a label over the fraction of its volume that it lacks, in cells labelled so far,
+MOST_BIAS = 0.4  # of a cell's volume, at most, which bounds the overlap that volume costs, unless
+SPARED_LOSS = 0.1  # the loss but for a tenth is more: a label that would lose half of its volume or more gets it back
+LEAST_SHARE = 0.05  # of a cell's volume: a label with less of it does not get the cell
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 
@@ -197,7 +199,7 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
         place = np.flatnonzero(dual.row == label)
         place = place[np.argmax(dual.volume[place])]
         best = cell[place]
-        if dual.volume[place] > 0.5 * (1.0 - MOST_BIAS) * dual.size[best] and n_of[labels[best]] > 1:
+        if dual.volume[place] > LEAST_SHARE * dual.size[best] and n_of[labels[best]] > 1:
             n_of[labels[best]] -= 1
             labels[best] = label
 
@@ -216,7 +218,7 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
         if wrong < least_wrong:
             least_wrong, best = wrong, dual.bias.copy()
         loss = 1.0 - volume / np.where(aim > 0.0, aim, np.inf)
-        bias = np.where(aim > 0.0, np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), 0.0)
+        bias = np.maximum(np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), loss - SPARED_LOSS) * (aim > 0.0)
         longest = np.where((bias - dual.bias) * before < 0.0, 0.5 * longest, longest)
         before = np.clip(bias - dual.bias, -longest, longest)
         dual.bias[:] += before
