@@ -65,8 +65,8 @@ result = tetopt.mesh_image(tetopt.content(image, labels), nodes=1200)
 mesh, of_cell = result.mesh, result.labels
 
 # %%
-# The exact volume of the lesion is 4/3 pi a b c. The cells with its label have a few per cent less, since flat facets
-# cut off part of a curved surface; more nodes reduce this.
+# The exact volume of the lesion is 4/3 pi a b c. The cells with its label have two per cent less. Flat facets would cut
+# off more of a curved surface, but nodes lie off it by what their facets cut off.
 
 fields = tetopt.cell_fields(mesh, image)
 exact_mm3 = 4.0 / 3.0 * np.pi * 8 * 6 * 6
