@@ -222,10 +222,7 @@ def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]
 
 
 def smooth_level(
-    inside: NDArray[np.bool_],
-    raw: NDArray[np.bool_],
-    off: NDArray[np.float32],
-    factors: Sequence[int],
+    inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray[np.float32], factors: Sequence[int]
 ) -> NDArray[np.float32]:
     """The smooth level of a label or a mask, (*shape) float32, clipped at `FARTHEST_LEVEL`.
 
