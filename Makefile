@@ -108,6 +108,7 @@ test-slurm: $(VENV)/.test
 	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install SLURM and munge, then run: TETOPT_SLURM=1 $(BIN)/python -m pytest tests/slurm"; exit 2; }
 	dpkg -s slurm-wlm munge >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends slurm-wlm munge; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check dask-jobqueue
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	TETOPT_SLURM=1 $(TESTED) -q -s --no-header tests/slurm
 
 # Two hundred subjects with failures put in, the client killed on the way: a quarter of an hour on two idle cores.

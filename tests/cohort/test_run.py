@@ -14,6 +14,7 @@ from tetopt.cohort import run as run_module
 from tetopt.cohort.layout import begin, clean, failure_path, log_path, numbers_path, subject_folder
 from tetopt.cohort.run import SubjectTask, run_all, run_subject
 from tetopt.errors import InputError
+from tetopt.job.events import Event
 from tetopt.job.options import JobOptions
 from tetopt.job.plan import changed
 from tetopt.workers import WorkerEnded
@@ -71,6 +72,17 @@ def test_a_subject_is_what_mesh_alone_writes(done, image, tmp_path):
     assert first == second
     assert not [each for each in (task.out / ".work").iterdir() if each.is_dir()]
     assert "reading and preparing the image" in log_path(task.out, "sub-1").read_text()
+
+
+def test_a_log_repeats_no_line(task, monkeypatch):
+    def said(job, listener, is_stopped):
+        for text in ("compiling, 1 of 2", "compiling, 1 of 2", "compiling, 2 of 2"):
+            listener(Event("progress", text))
+        raise InputError("enough")
+
+    monkeypatch.setattr(run_module, "run", said)
+    run_subject(task)
+    assert log_path(task.out, "sub-1").read_text() == "compiling, 1 of 2\ncompiling, 2 of 2\nenough\n"
 
 
 def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, tmp_path):

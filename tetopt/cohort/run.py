@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 from tetopt.cohort.layout import FIGURES_NAME, WORK_NAME, failure_path, log_path, mesh_name, publish
 from tetopt.errors import InputError, error_words
 from tetopt.io.text import plain
+from tetopt.job.events import Event
 from tetopt.job.job import Job
 from tetopt.job.options import JobOptions
 from tetopt.job.run import Result, run
@@ -86,6 +87,10 @@ def _meshed(task: SubjectTask, lines: list[str]) -> Result:
     """Run a subject's job in a folder of its own and publish what it writes; add the texts of its events to `lines`."""
     work = Path(tempfile.mkdtemp("", f"{task.key}.run-{os.getpid()}-", task.out / WORK_NAME))
 
+    def hear(event: Event) -> None:
+        if lines[-1:] != [event.text]:  # compiling kernels repeats its progress
+            lines.append(event.text)
+
     def is_stopped() -> bool:
         work.stat()  # an error if the cohort was interrupted, which removes the folder
         return False
@@ -95,7 +100,7 @@ def _meshed(task: SubjectTask, lines: list[str]) -> Result:
         outputs = {"output": mesh, "json_path": mesh.with_suffix(".json"), "figures": work / FIGURES_NAME}
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: lines.append(str(message))
-            result = run(Job(**vars(task.job) | outputs), lambda event: lines.append(event.text), is_stopped)
+            result = run(Job(**vars(task.job) | outputs), hear, is_stopped)
         publish(work, task.out, task.key)
         return result
     finally:
