@@ -9,7 +9,7 @@ from tetopt.contents.content import content
 from tetopt.energy.discretization import combined
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, interface_energy, node_stars, remeasure
-from tetopt.engine.density import Limits, exchange
+from tetopt.engine.density import Limits, _put_middle, best_splits, exchange, roomy, worth_of_split
 from tetopt.engine.flips import flip
 from tetopt.engine.interfaces import with_labels
 from tetopt.engine.loop import GRADED_K_D
@@ -129,6 +129,35 @@ def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
         remeasure(state)
         np.testing.assert_allclose(state.complex.sums[:n_cells], sums, atol=1e-6 * np.abs(sums).max(), err_msg=move)
         np.testing.assert_allclose(state.complex.E_shape[:n_cells], E_shape, rtol=1e-9, err_msg=move)
+
+
+@pytest.mark.parametrize("has_mask", [False, True])
+@pytest.mark.parametrize("has_labels", [False, True])
+def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
+    """Of each node: none of its other edges would have gained more, though few are evaluated in full."""
+    image = CASES["balls"]
+    target = content(image, image if has_labels else None, tetopt.Image(image.data > 0.0) if has_mask else None)
+    mesh = tetopt.octree_mesh(target, 200)
+    state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
+    if has_labels:
+        state = with_labels(state, target, target.smooth, mesh)
+    N, stars = len(state.complex.ticks), node_stars(state)
+    room, x = roomy(state, N, 0), np.empty((4, 3))
+    splits = best_splits(room, stars, np.ones(N, dtype=bool), Limits(0.0, np.full(N, np.inf), 0.0, np.full(N, np.inf)))
+    energy = state.objective.geometry * state.complex.E_shape[: len(mesh.cells)]
+    energy = energy + state.objective.image * cell_squares(state)
+    n_fitted = 0
+    for a in range(N):
+        around = stars.cells[stars.start[a] : stars.start[a + 1]]
+        near = np.unique(mesh.cells[around])
+        gains = [
+            worth_of_split(x, room, stars, a, b, N + a, -np.inf)
+            for b in near[near > a]
+            if _put_middle(room, stars, a, b, N + a)
+        ]
+        assert splits.gain[a] == pytest.approx(max(gains, default=-np.inf), rel=1e-9)
+        n_fitted += splits.gain[a] > energy[around[(mesh.cells[around] == splits.other[a]).any(axis=1)]].sum()
+    assert (n_fitted > 5) == has_mask  # whose misfit falls by more than the energy of the cells around
 
 
 def test_energy_falls_with_labels(labelled_state):

@@ -517,8 +517,9 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
         if (b > a or not moves.may_move[b]) and squared_length(state, a, b) >= 4.0 * limits.shortest * limits.shortest:
             ratio = squared_ratio(state, a, b, limits.target)
             bound[number] = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
-            bound[number] += np.inf if state.objective.surface > 0.0 else _energy_of_edge(state, stars, a, b)
-    for _ in range(count):  # no edge gains more than its cells' energy, so the most expensive come first
+            bound[number] += np.inf if _may_fit(state, a, b) else _energy_of_edge(state, stars, a, b)
+    # Unless it may fit a mask, no edge gains more than its energy; without a mask, less tension is not looked for.
+    for _ in range(count):
         number = int(np.argmax(bound[:count]))
         if not bound[number] > best:
             break
@@ -533,12 +534,26 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
 
 
 @helper
+def _may_fit(state: State, a: int, b: int) -> bool:
+    """True if a split of the edge (a, b) may change the misfit to a mask: on its surface, where both ends lie."""
+    is_frozen = state.complex.is_frozen
+    return state.objective.surface > 0.0 and is_frozen[a, 3] and is_frozen[b, 3]
+
+
+@helper
 def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
-    """Energy of the cells around the edge (a, b)."""
-    energy = 0.0
+    """Energy of the cells around the edge (a, b) and, within a mask, of the facets between labels at it."""
+    mesh, energy = state.complex, 0.0
     for r in range(stars.start[a], stars.start[a + 1]):
-        if has_node(state.complex.cells, stars.cells[r], b):
-            energy += cell_energy(state, stars.cells[r])
+        cell = stars.cells[r]
+        if not has_node(mesh.cells, cell, b):
+            continue
+        energy += cell_energy(state, cell)
+        for k in range(mesh.cells.shape[1] if state.objective.surface > 0.0 else 0):
+            if mesh.cells[cell, k] not in (a, b) and is_interface(mesh, cell, k):
+                i, j, m = outward(mesh.cells, cell, k)
+                tension = pair_tension(state.objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]])
+                energy += 0.5 * tension * facet_area(mesh.ticks, i, j, m, state.objective)
     return energy
 
 
@@ -596,7 +611,8 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
                 return -np.inf
         if objective.tension > 0.0 and state.complex.meeting[p, 1] >= 0:
             shape += _rise_of_tension(state, cell, a, b, p)
-    if old - shape <= least_gain and objective.surface == 0.0:
+    has_misfit = objective.surface > 0.0 and state.complex.is_frozen[p, 3]
+    if old - shape <= least_gain and not has_misfit:
         return -np.inf
     if objective.image == 0.0:
         return old - shape
@@ -626,7 +642,7 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
                 new += objective.image * image_energy(sums, half, state.complex.labels[cell], objective)
                 misfit += wrong_side(sums, half, objective)
             misfit -= wrong_side(state.complex.sums, cell, objective)
-            if old - new <= least_gain and objective.surface == 0.0:  # otherwise the misfit may still fall
+            if old - new <= least_gain and not has_misfit:  # otherwise the misfit may still fall
                 return -np.inf
     worth = old - new - misfit
     return worth if worth > least_gain else -np.inf
