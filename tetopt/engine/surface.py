@@ -344,19 +344,20 @@ def _is_on_mask(state: State, corners: NDArray) -> bool:
 def _facet_means(state: State, cell: int, other: int, corners: NDArray, places: NDArray, weights: NDArray) -> tuple:
     """The mean of a facet's constraint over the facet, and its mean at the corners."""
     ticks, scale, whole, ends = state.complex.ticks, 2.0**-state.objective.bits, 0.0, 0.0
+    one = beyond = state.sides.level
+    if other >= 0:
+        of_cell, of_other = state.complex.labels[cell], state.complex.labels[other]
+        channel, levels = state.sides.channel, state.sides.levels
+        one, beyond = levels[channel[min(of_cell, of_other)]], levels[channel[max(of_cell, of_other)]]
     for s in range(len(weights)):
         i, j, k = 0.0, 0.0, 0.0
         for m in range(len(corners)):
             i += places[s, m] * scale * ticks[corners[m], 0]
             j += places[s, m] * scale * ticks[corners[m], 1]
             k += places[s, m] * scale * ticks[corners[m], 2]
-        if other < 0:
-            value = level_at(state.sides.level, i, j, k)
-        else:
-            low = min(state.complex.labels[cell], state.complex.labels[other])
-            high = max(state.complex.labels[cell], state.complex.labels[other])
-            channel, levels = state.sides.channel, state.sides.levels
-            value = level_at(levels[channel[low]], i, j, k) - level_at(levels[channel[high]], i, j, k)
+        value = level_at(one, i, j, k)
+        if other >= 0:
+            value -= level_at(beyond, i, j, k)
         whole += weights[s, 0] * value
         ends += weights[s, 1] * value
     return whole, ends
