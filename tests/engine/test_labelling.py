@@ -1,5 +1,7 @@
 """Labels of cells: energy, fragments, manifold interfaces, and which cells may change without changing topology."""
 
+from typing import NamedTuple
+
 import naive
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import tetopt
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine import labelling
 from tetopt.engine.complex import fill_across
-from tetopt.engine.labelling import components_of, keeps_topology, labelled, voxel_components
+from tetopt.engine.labelling import component_sizes, components_of, keeps_topology, labelled
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import stars
 
@@ -27,11 +29,29 @@ def whole(labels, n_labels, size):
     return csr_array((size, (np.arange(len(labels)), labels)), shape=(len(labels), n_labels))
 
 
+class Labelling(NamedTuple):
+    """The label of each cell, and remaining defects."""
+
+    labels: np.ndarray  # (M,)
+    n_moved: int  # cells whose label is not that of most of their voxels
+    n_nonmanifold: int  # edges and nodes where only two labels meet
+    components: list[int]  # of the cells of each label, linked by facets
+    lost: list[int]  # labels with voxels but without cells
+
+
 def solved(points, cells, labels, n_labels=2, components=None, weight=None, counts=None):
-    """`labelled` of cells that are full of one label each."""
+    """`labelled`, by default of cells that are full of one label each, and its defects."""
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
     components = [np.array([1])] * n_labels if components is None else components
-    return labelled(points, cells, across_of(cells, len(points)), counts, components, None, False, weight=weight)
+    across = across_of(cells, len(points))
+    labels = labelled(points, cells, across, counts, components, None, False, weight=weight)
+    return Labelling(
+        labels,
+        int((labels != counts.toarray().argmax(axis=1)).sum()),
+        int(labelling._nonmanifold(labelling._dual(points, cells, across, counts, None, weight), labels)[1].sum()),
+        np.bincount(components_of(across, labels)[1], minlength=n_labels).tolist(),
+        np.setdiff1d(counts.indices[counts.data > 0.0], labels).tolist(),
+    )
 
 
 def lattice(n, cubes):
@@ -195,12 +215,11 @@ def test_a_ball_is_one_component_with_a_manifold_surface(seed):
     mesh, image, counts = ball(seed=seed)
     result = solved(mesh.points, mesh.cells, None, counts=counts)
     inside = mesh.cells[result.labels == 1]
-    assert result.components.tolist() == [1, 1]
-    assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+    assert result.components == [1, 1]
+    assert result.n_nonmanifold == 0
     assert naive.euler(naive.faces_of(inside)) == 1
     assert volumes(mesh.points, inside).sum() == pytest.approx(image.data.sum(), rel=0.12)
-    assert result.n_moved == (result.labels != counts.toarray().argmax(axis=1)).sum()
-    assert len(result.lost) == 0
+    assert result.lost == []
 
 
 def test_tension_takes_half_of_a_label_at_most():
@@ -220,8 +239,8 @@ def test_a_disc_in_the_plane():
     loose = np.random.default_rng(2).random(len(counts)) < 0.05
     counts[loose] = counts[loose][:, ::-1]
     result = solved(mesh.points, mesh.cells, None, counts=csr_array(counts))
-    assert result.components.tolist() == [1, 1]
-    assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+    assert result.components == [1, 1]
+    assert result.n_nonmanifold == 0
     assert naive.nonmanifold(mesh.cells, result.labels) == {}
     assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() == pytest.approx(image.data.sum(), rel=0.1)
 
@@ -245,8 +264,8 @@ def test_fragments_go_and_components_stay():
         ends[name] = solved(
             mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)]
         )
-    assert ends["two"].components.tolist() == [1, 2]
-    assert ends["one"].components.tolist() == ends["speck"].components.tolist() == [1, 1]
+    assert ends["two"].components == [1, 2]
+    assert ends["one"].components == ends["speck"].components == [1, 1]
     assert (ends["one"].labels[is_small] == 0).all()
     assert (ends["two"].labels[is_small] == 1).mean() > 0.5
 
@@ -256,8 +275,8 @@ def test_what_hangs_together_in_the_voxels_is_bridged():
     mesh, counts, is_small, (large, small) = two_balls(0.45)
     for sizes, n_pieces in (([large, small], 2), ([large + small], 1)):
         result = solved(mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)])
-        assert result.components.tolist() == [1, n_pieces]
-        assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+        assert result.components == [1, n_pieces]
+        assert result.n_nonmanifold == 0
         assert (result.labels[is_small] == 1).mean() > 0.5
 
 
@@ -271,7 +290,7 @@ def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
         assert len(naive.nonmanifold(mesh.cells, labels)) > 0
         result = solved(mesh.points, mesh.cells, labels, components=[np.array([60]), np.array([1, 1])], weight=1e-6)
         assert naive.nonmanifold(mesh.cells, result.labels) == {}
-        assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+        assert result.n_nonmanifold == 0
         assert 0 < result.n_moved < 10
 
 
@@ -283,7 +302,7 @@ def test_a_label_of_one_cell_stays_and_one_without_is_lost():
     full[200, 3] = 0.1
     result = solved(mesh.points, mesh.cells, None, 4, counts=csr_array(full), weight=50.0)
     assert (result.labels == 2).any()
-    assert result.lost.tolist() == [3]
+    assert result.lost == [3]
 
 
 def test_no_label_goes_for_a_bridge():
@@ -293,10 +312,10 @@ def test_no_label_goes_for_a_bridge():
     counts = csr_array([[1.0, 0.0], [0.08, 0.1], [1.0, 0.0]])
     result = solved(points, cells, None, counts=counts, components=[np.array([2])] * 2, weight=1e-9)
     assert result.labels.tolist() == [0, 1, 1]
-    assert len(result.lost) == 0
+    assert result.lost == []
 
 
 def test_components_of_voxels():
     partition = np.array([[0, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 3]])
-    sizes = voxel_components(partition, 4)
+    sizes = component_sizes(partition, 4)
     assert [s.tolist() for s in sizes] == [[5], [3, 3], [], [1]]

@@ -44,8 +44,9 @@ def with_labels(
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     counts, contacts = cell_contents(image, members, mesh, voxels)
-    made = labelled(mesh.points, mesh.cells, across, counts, voxels.components, contacts, keeps_volumes)
-    state.complex.labels[:n_cells] = made.labels
+    state.complex.labels[:n_cells] = labelled(
+        mesh.points, mesh.cells, across, counts, voxels.components, contacts, keeps_volumes
+    )
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),

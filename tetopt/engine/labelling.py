@@ -71,17 +71,6 @@ class LabelVoxels(NamedTuple):
     places: NDArray[np.int64]  # flat indices of voxels next to one of a label that is apart from theirs
 
 
-class Labelling(NamedTuple):
-    """The label of each cell, as rows of the labels, and remaining defects."""
-
-    labels: NDArray[np.int64]  # (M,)
-    n_moved: int  # cells whose label is not that of most of their voxels
-    n_nonmanifold_edges: int  # where only two labels meet; 0 in 2-D
-    n_nonmanifold_nodes: int
-    components: NDArray[np.int64]  # (K,) number of components of cells, linked by facets
-    lost: NDArray[np.int64]  # labels with voxels but without cells
-
-
 class Dual(NamedTuple):
     """Adjacency of a mesh's cells, and their voxels."""
 
@@ -103,7 +92,7 @@ def labelled(
     points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     components: list[NDArray], contacts: Contacts | None = None, keeps_volumes: bool = True,
     weight: float | None = None,
-) -> Labelling:  # fmt: skip
+) -> NDArray[np.int64]:  # fmt: skip
     """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without fragments.
 
     The iteration ends, since every move except that of fragments lowers an energy, and fragments are moved at most
@@ -120,7 +109,7 @@ def labelled(
     counts : (M, K) sparse array in rows
         Voxels of each label in each cell, with fractions of a voxel if a cell contains no centre. No row is empty.
     components : list of K arrays
-        Voxels in each component of each label, descending: `voxel_components`. As many components of cells may stay.
+        Voxels in each component of each label, descending: `component_sizes`. As many components of cells may stay.
     contacts : Contacts, optional
         Labels that are separate in the voxels; none by default.
     keeps_volumes : bool
@@ -131,26 +120,16 @@ def labelled(
 
     Returns
     -------
-    Labelling
+    (M,) int64
+        The label of each cell, as rows of the labels.
     """
-    dual, n_labels = _dual(points, cells, across, counts, contacts, weight), counts.shape[1]
+    dual = _dual(points, cells, across, counts, contacts, weight)
     voxel = float(dual.volume.sum() / counts.sum())
-    aim = np.bincount(dual.row, dual.volume, n_labels).astype(np.float64)
+    aim = np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64)
     least = LEAST_FRACTION * aim
-    begin = _majority(dual)
     if keeps_volumes:
         _balance(dual, aim, least)
-    labels = _given(dual, least, voxel, components)
-    faces, is_two = _nonmanifold(dual, labels)
-    _, of_component = components_of(across, labels)
-    return Labelling(
-        labels,
-        int((labels != begin).sum()),
-        int((is_two & (faces[:, 1] >= 0)).sum()),
-        int((is_two & (faces[:, 1] < 0)).sum()),
-        np.bincount(of_component, minlength=n_labels),
-        np.flatnonzero((aim > 0.0) & (np.bincount(labels, minlength=n_labels) == 0)),
-    )
+    return _given(dual, least, voxel, components)
 
 
 def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
@@ -225,8 +204,8 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
     dual.bias[:] = best
 
 
-def voxel_components(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
-    """Voxels in each face-connected component of each label of a grid, descending."""
+def component_sizes(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
+    """Number of voxels in each face-connected component of each label of a grid, descending."""
     boxes = scipy.ndimage.find_objects(partition + 1, n_labels)
     parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
     return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
@@ -248,7 +227,7 @@ def label_voxels(partition: NDArray[np.int64], spacing: NDArray[np.float64], n_l
         is_met, here = is_apart[rows[:-1], rows[1:]], np.moveaxis(is_place, d, 0)
         here[:-1] |= is_met
         here[1:] |= is_met
-    return LabelVoxels(voxel_components(partition, n_labels), is_apart, np.flatnonzero(is_place))
+    return LabelVoxels(component_sizes(partition, n_labels), is_apart, np.flatnonzero(is_place))
 
 
 def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
