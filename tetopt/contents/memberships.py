@@ -279,11 +279,19 @@ def near_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The least and the largest level of each voxel."""
-    inside, size = raw < 0.0, np.abs(raw)
-    least = np.maximum(size - MOST_LIFTED, NEAR_SURFACE[0])
-    most = np.where(size <= 0.5, NEAR_SURFACE[1], size + MOST_LIFTED)
-    least, most = least - off, most + off
-    return np.where(inside, -most, least).astype(np.float32), np.where(inside, -least, most).astype(np.float32)
+    low, high = np.empty_like(raw), np.empty_like(raw)
+    _fill_bounds(low.reshape(-1), high.reshape(-1), raw.reshape(-1), off.reshape(-1))
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _fill_bounds(low: NDArray, high: NDArray, raw: NDArray, off: NDArray) -> None:
+    lifted, nearest, farthest = np.float32(MOST_LIFTED), np.float32(NEAR_SURFACE[0]), np.float32(NEAR_SURFACE[1])
+    for v in range(len(raw)):
+        size = abs(raw[v])
+        least = max(size - lifted, nearest) - off[v]
+        most = (farthest if size <= 0.5 else size + lifted) + off[v]
+        low[v], high[v] = (-most, -least) if raw[v] < 0.0 else (least, most)
 
 
 def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
@@ -370,11 +378,12 @@ def _fill_block_sums(missing: NDArray, area: NDArray, level: NDArray, mean: NDAr
                             lacking[i, j, k] = is_near[i, j, k] = np.float32(0.0)
                             if x >= level.shape[0] or y >= level.shape[1] or z >= level.shape[2]:
                                 continue
-                            slope = min(max(_slope(level, x, y, z), np.float32(LEAST_SLOPE)), one)
-                            distance = mean[x, y, z] / slope
+                            distance = mean[x, y, z]
+                            if abs(distance) < half:  # as the slope is 1 at most, others are full or empty anyway
+                                distance /= min(max(_slope(level, x, y, z), np.float32(LEAST_SLOPE)), one)
+                                is_near[i, j, k] = np.float32(abs(distance) < half)
                             filled = min(max(half - distance, np.float32(0.0)), one)
                             lacking[i, j, k] = np.float32(raw[x, y, z]) - filled
-                            is_near[i, j, k] = np.float32(abs(distance) < half)
                 missing[a, b, c], area[a, b, c] = _block_sum(lacking), _block_sum(is_near)
 
 
@@ -387,20 +396,31 @@ def _add_between_centres(missing: NDArray, area: NDArray, level: NDArray, raw: N
     corner, value = np.empty((8, 3), dtype=np.int64), np.empty(8)
     for i in range(max(level.shape[0] - 1, 1)):
         for j in range(max(level.shape[1] - 1, 1)):
+            i1, j1 = min(i + 1, level.shape[0] - 1), min(j + 1, level.shape[1] - 1)
+            low, high = _ends(level, i, j, i1, j1, 0)
             for k in range(max(level.shape[2] - 1, 1)):
-                for m in range(8):
-                    corner[m, 0] = min(i + (m >> 2), level.shape[0] - 1)
-                    corner[m, 1] = min(j + (m >> 1 & 1), level.shape[1] - 1)
-                    corner[m, 2] = min(k + (m & 1), level.shape[2] - 1)
-                    value[m] = level[corner[m, 0], corner[m, 1], corner[m, 2]]
-                if value.min() > 0.0 or value.max() < 0.0:
+                k1, low_before, high_before = min(k + 1, level.shape[2] - 1), low, high
+                low, high = _ends(level, i, j, i1, j1, k1)
+                if min(low_before, low) > 0.0 or max(high_before, high) < 0.0:
                     continue
+                for m in range(8):
+                    corner[m, 0] = i1 if m & 4 else i
+                    corner[m, 1] = j1 if m & 2 else j
+                    corner[m, 2] = k1 if m & 1 else k
+                    value[m] = level[corner[m, 0], corner[m, 1], corner[m, 2]]
                 for m in range(8):
                     x, y, z = corner[m, 0], corner[m, 1], corner[m, 2]
                     distance, slope = _in_octant(value, m)
                     filled = min(max(0.5 - distance, 0.0), 1.0)
                     missing[x // 2, y // 2, z // 2] += 0.125 * (raw[x, y, z] - filled)
                     area[x // 2, y // 2, z // 2] += 0.25 / slope * (abs(distance) < 0.5)
+
+
+@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _ends(level: NDArray, i: int, j: int, i1: int, j1: int, k: int) -> tuple[float, float]:
+    """The least and the largest of four levels."""
+    a, b, c, d = level[i, j, k], level[i, j1, k], level[i1, j, k], level[i1, j1, k]
+    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
