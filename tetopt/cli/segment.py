@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from tetopt import Content, InputError, Mesh, save_image
 from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.energy.sampling import overlap_of
-from tetopt.job.inputs import read_labels, read_mesh, voxels_of
+from tetopt.job.inputs import image_voxels, read_labels, read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.files import checked_output
@@ -42,7 +42,7 @@ def segment_command(
     if image_path is None:
         raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
     loaded = read_mesh(mesh_path)
-    what = cast(Content, voxels_of(loaded, mesh_path, image_path, part).content)
+    what, _ = image_voxels(loaded, mesh_path, image_path, part)
     image, mesh = what.given, loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
     inside = _voxels_in(mesh, what, mesh_path, image_path)

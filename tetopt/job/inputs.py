@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -343,34 +344,58 @@ class MeshVoxels(NamedTuple):
     is_other: bool  # True if the mesh's file names another image
 
 
+Masks = Callable[[], dict[tuple[Path, Align], Image]]  # reads the mask of the options, as `read_mask` does, once
+
+
 def voxels_of(
     loaded: MeshFile, mesh: Path, image: Path | None, part: MaskedPart, labels: Path | None = None
 ) -> MeshVoxels:
     """Read the image and the labels beside a mesh's file, without the voxels outside its mask.
 
-    The image's box is checked before the mask is read. The mesh gets the majority labels of the voxels in its cells.
+    The mesh gets the majority labels of the voxels in its cells.
 
     Raises
     ------
     InputError
-        As for `mask_for` and `warn_of_other_image`; the dimension of the image or the labels differs from the mesh's.
+        As for `image_voxels`; the dimension of the labels differs from the mesh's.
     """
-    content, of_labels, is_other = None, None, False
+    content, is_other, masks = None, False, cache(partial(read_mask, part))
     if image is not None:
-        whole = read_image(image, part)
-        if whole.ndim != loaded.mesh.ndim:
-            raise InputError(f"{image}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
-        is_other = warn_of_other_image(loaded, mesh, image, whole, is_registered=part.registered)
-        whole, beside, _ = image_and_others(whole, image, part, read_mask(part))
-        content = _within(whole, part, beside, loaded)
+        content, is_other = image_voxels(loaded, mesh, image, part, masks)
     if labels is not None:
         if image is not None:
             warn_of_other_world(image, labels)
-        loaded, of_labels = _with_labels(loaded, labels, part)
-    counted = of_labels if content is None else content
-    if counted is not None and part.mask is not None and MASK_TEXT not in loaded.field_data:
-        warn_of_other_mask(loaded.mesh, counted.own_mask)
+        loaded, of_labels = _with_labels(loaded, labels, part, masks)
+        if content is None:
+            _warn_of_mask(loaded, of_labels, part)
     return MeshVoxels(loaded, content, is_other)
+
+
+def image_voxels(
+    loaded: MeshFile, mesh: Path, image: Path, part: MaskedPart, masks: Masks | None = None
+) -> tuple[Content, bool]:
+    """Read the image beside a mesh's file, without the voxels outside its mask; True if the file names another one.
+
+    The image's box is checked before the mask is read.
+
+    Raises
+    ------
+    InputError
+        As for `mask_for` and `warn_of_other_image`; the dimension of the image differs from the mesh's.
+    """
+    whole = read_image(image, part)
+    if whole.ndim != loaded.mesh.ndim:
+        raise InputError(f"{image}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
+    is_other = warn_of_other_image(loaded, mesh, image, whole, is_registered=part.registered)
+    whole, beside, _ = image_and_others(whole, image, part, read_mask(part) if masks is None else masks())
+    content = _within(whole, part, beside, loaded)
+    _warn_of_mask(loaded, content, part)
+    return content, is_other
+
+
+def _warn_of_mask(loaded: MeshFile, counted: Content, part: MaskedPart) -> None:
+    if part.mask is not None and MASK_TEXT not in loaded.field_data:
+        warn_of_other_mask(loaded.mesh, counted.own_mask)
 
 
 def _within(image: Image, part: MaskedPart, beside: Callable[..., Image], loaded: MeshFile) -> Content:
@@ -380,14 +405,14 @@ def _within(image: Image, part: MaskedPart, beside: Callable[..., Image], loaded
     return Content(continued(image, beyond), continuation=beyond, whole=image)
 
 
-def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart) -> tuple[MeshFile, Content]:
+def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart, masks: Masks) -> tuple[MeshFile, Content]:
     """Return the mesh with the majority labels of an image's voxels, instead of the file's, and these voxels."""
     labels = checked_labels(str(path), read_companion(path, part.spacing_mm), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
 
     def beside(other: Path, aligned: Align) -> Image:
-        return aligned(read_mask(part)[other, aligned], labels, str(other))
+        return aligned(masks()[other, aligned], labels, str(other))
 
     try:
         counted = _within(labels, part, beside, loaded)
