@@ -47,6 +47,7 @@ from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.engine.surface import fill_offsets
 from tetopt.errors import InputError
+from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import regular_edge, volumes
 from tetopt.image import Image, transformed
 from tetopt.interop.notebook import with_bar
@@ -270,12 +271,12 @@ def followed(
 
 
 def gives_labels(iteration: int, course: Course) -> bool:
-    """True if cells get labels from the voxels: first in `LABELLED_AT`, and again while nodes are exchanged.
+    """True if cells get labels from the voxels: first in `LABELLED_AT`, and again at intervals, not in the last.
 
     In between labels keep their topology. Labels assigned only once would keep holes of sheets thinner than the cells.
     """
     first = min(LABELLED_AT, course.iterations)
-    return iteration == first or (first < iteration <= course.n_early and (iteration - first) % LABELLED_EVERY == 0)
+    return iteration == first or (first < iteration < course.iterations and (iteration - first) % LABELLED_EVERY == 0)
 
 
 def prepare_kernels(
@@ -428,7 +429,9 @@ class Run:
             return
         members = self.content.smooth.memberships
         if self.label_voxels is None:
-            self.label_voxels = label_voxels(members.partition, self.image.spacing, len(members.labels))
+            region, rows = self.content.region, members.partition
+            rows = rows if region is None else np.where(region.inside, rows, OUTSIDE_LABEL)
+            self.label_voxels = label_voxels(rows, self.image.spacing, len(members.labels))
         self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.label_voxels)
         self.has_labels = True
         self.hope[:] = np.inf

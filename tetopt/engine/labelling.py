@@ -34,14 +34,18 @@ from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
-LEAST_FRACTION = 0.5  # of a label's volume that tension must leave, so that small labels do not vanish
-LAST_FRACTION = 0.1  # of that, which mending must leave: it may finally take more, rather than leave a pinch
+# of a label's volume that tension and mending must leave; with .5, fluid has .54 of its volume at Dice .57, not .80 at
+# .65 (MNI152, 5,000 nodes), and ribs of a CT have half of theirs
+LEAST_FRACTION = 0.9
+MOST_FRACTION = 1.2  # of a label's volume that mending may reach; without, a slab of a third of its cells gets 1.7
+LAST_FRACTIONS = 0.05, 1.5  # the same two at the end, when the last pinches are mended
+UNFIT_FRACTION = 0.3  # of the volume of a label smaller than a cell: if its cells have no more, it is dropped
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
 COMPONENT_FRACTION = 0.5
 BRIDGE_RATIO = 3.0  # cost of a bridge relative to the voxels lost otherwise; with 1 a coarse mesh loses half a rib
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second usually has nothing left to do
 TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: pinches between two labels are removed at any cost
-MORE_LABELS_WEIGHT = 0.3  # where more labels meet: this removes edges; with 4, small organs lose a tenth of their Dice
+MORE_LABELS_WEIGHT = 2.0  # where more labels meet; with .3, fluid has twice as many pinches
 APART_TENSION = 10.0  # times the usual, between labels that are separate in the voxels
 PLACE_TENSION = 3.0  # the same, at places where they touch
 APART_WEIGHT = 10.0  # where such labels meet only at a node or an edge: a sheet between them is pierced
@@ -96,7 +100,8 @@ def labelled(
     """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without fragments.
 
     The iteration ends, since every move except that of fragments lowers an energy, and fragments are moved at most
-    `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps at least one cell.
+    `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps at least one cell, unless
+    it is smaller than a cell and has next to nothing of it (`UNFIT_FRACTION`).
 
     Parameters
     ----------
@@ -126,18 +131,20 @@ def labelled(
     dual = _dual(points, cells, across, counts, contacts, weight)
     voxel = float(dual.volume.sum() / counts.sum())
     aim = np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64)
-    least = LEAST_FRACTION * aim
     if keeps_volumes:
-        _balance(dual, aim, least)
-    return _given(dual, least, voxel, components)
+        _balance(dual, aim)
+    labels = _given(dual, aim, voxel, components)
+    is_small = (np.bincount(labels, dual.size, len(aim)) < UNFIT_FRACTION * aim) & (aim < dual.size.mean())
+    _give_away(dual, labels, is_small[labels])
+    return labels
 
 
-def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
+def _given(dual: Dual, aim: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
     """Labels of cells, (M,), by the dual's bias."""
-    labels = _majority(dual)
+    bounds, labels = np.multiply.outer((LEAST_FRACTION, MOST_FRACTION), aim), _majority(dual)
     if dual.bias.any():
         _keep_each(dual, labels)
-    _settle(dual, labels, least, False)
+    _settle(dual, labels, bounds[0], False)
     is_bridge = np.zeros(len(labels), dtype=bool)
     is_near, is_sound, is_due = np.ones((3, len(dual.scale)), dtype=bool)
     mended = np.full(len(labels), -1)
@@ -148,12 +155,12 @@ def _given(dual: Dual, least: NDArray[np.float64], voxel: float, components: lis
         is_near[dual.cells[labels != mended]] = True
         is_due[dual.cells[is_near[dual.cells].any(axis=1)]] = True
         is_near[:] = is_due
-        _mend_near(dual, labels, is_bridge, least, is_near, is_sound, is_due)
+        _mend_near(dual, labels, is_bridge, bounds, is_near, is_sound, is_due)
         mended = labels.copy()
-        _settle(dual, labels, least, True)
+        _settle(dual, labels, bounds[0], True)
         if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
             break
-    _mend_pairs(dual, labels, LAST_FRACTION * least)
+    _mend_pairs(dual, labels, np.multiply.outer(LAST_FRACTIONS, aim))
     return labels
 
 
@@ -165,8 +172,10 @@ def unpinched(
 
     Arguments as for `labelled`; no label loses its last cell. Pinches that cannot be mended remain.
     """
-    dual, labels = _dual(points, cells, across, counts, contacts, None), labels.copy()
-    _mend_pairs(dual, labels, np.full(counts.shape[1], float(dual.size.min())))
+    labels = labels.copy()
+    for each in (contacts, None):  # false contact may forbid all moves that are left
+        dual = _dual(points, cells, across, counts, each, None)
+        _mend_pairs(dual, labels, np.repeat([[float(dual.size.min())], [np.inf]], counts.shape[1], axis=1))
     return labels
 
 
@@ -183,7 +192,7 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
             labels[best] = label
 
 
-def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
+def _balance(dual: Dual, aim: NDArray[np.float64]) -> None:
     """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that its cells lack.
 
     Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes is kept.
@@ -191,7 +200,7 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
     longest, before, least_wrong, best = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim)), np.inf, dual.bias
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
-        _settle(dual, labels, least, False)
+        _settle(dual, labels, LEAST_FRACTION * aim, False)
         volume = np.bincount(labels, dual.size, len(aim))
         wrong = float(np.abs(volume - aim).sum())
         if wrong < least_wrong:
@@ -212,13 +221,18 @@ def component_sizes(partition: NDArray[np.int64], n_labels: int) -> list[NDArray
 
 
 def label_voxels(partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int) -> LabelVoxels:
-    """Components of labels in the voxels of a grid, pairs that share hardly any area, and places where these touch."""
-    steps = [np.moveaxis(partition, d, 0) for d in range(partition.ndim)]
-    area = np.zeros(n_labels * n_labels)
+    """Components of labels in the voxels of a grid, pairs that share hardly any area, and places where these touch.
+
+    `partition` has -1 at voxels outside a mask, which neither link components nor touch a label.
+    """
+    steps, n_rows = [np.moveaxis(partition, d, 0) for d in range(partition.ndim)], n_labels + 1  # the last row: outside
+    area = np.zeros(n_rows * n_rows)
     for rows, step in zip(steps, spacing, strict=True):
-        area += np.prod(spacing) / step * np.bincount((n_labels * rows[:-1] + rows[1:]).ravel(), minlength=len(area))
-    area = area.reshape(n_labels, n_labels) + area.reshape(n_labels, n_labels).T
+        pairs = n_rows * (rows[:-1] % n_rows) + rows[1:] % n_rows
+        area += np.prod(spacing) / step * np.bincount(pairs.ravel(), minlength=len(area))
+    area = area.reshape(n_rows, n_rows) + area.reshape(n_rows, n_rows).T
     np.fill_diagonal(area, 0.0)
+    area[-1] = area[:, -1] = 0.0
     surface = area.sum(axis=1)
     is_apart = area < LEAST_CONTACT_FRACTION * np.minimum(surface[:, None], surface)
     np.fill_diagonal(is_apart, False)
@@ -227,7 +241,7 @@ def label_voxels(partition: NDArray[np.int64], spacing: NDArray[np.float64], n_l
         is_met, here = is_apart[rows[:-1], rows[1:]], np.moveaxis(is_place, d, 0)
         here[:-1] |= is_met
         here[1:] |= is_met
-    return LabelVoxels(component_sizes(partition, n_labels), is_apart, np.flatnonzero(is_place))
+    return LabelVoxels(component_sizes(partition, n_labels), is_apart[:-1, :-1].copy(), np.flatnonzero(is_place))
 
 
 def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -466,12 +480,14 @@ def _without_fragments(
 
     A label's components are ranked by the number of its voxels that they contain. The first stays, and each further one
     if the component of voxels of the same rank is not far smaller. The others are linked to a component of the same
-    label or, if that costs more than `BRIDGE_RATIO` of the voxels lost otherwise, go to their neighbours cell by cell.
+    label or, if that costs more than `BRIDGE_RATIO` of the voxels lost otherwise, go to their neighbours cell by cell;
+    those with more of a label than it may lose (`LEAST_FRACTION`) stay apart.
     """
     number, of_component = components_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     is_own = dual.row == labels[cell]
     content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_component))
+    aim = np.bincount(dual.row, dual.volume, len(components))
     # Volume of the best other label in a cell: an upper limit of the loss if it goes.
     others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
     most = BRIDGE_RATIO * (content - np.bincount(number, others, len(of_component)))
@@ -499,6 +515,8 @@ def _without_fragments(
             is_loose[bridge[:count]] = is_loose[own] = False
             is_bridge[bridge[:count]] = True
             moved += count
+        elif content[component] > (1.0 - LEAST_FRACTION) * aim[of_component[component]]:
+            is_loose[own] = False
     return moved + _give_away(dual, labels, is_loose)
 
 
@@ -612,15 +630,16 @@ def _nonmanifold(
 
 
 def _mend_near(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64],
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], bounds: NDArray[np.float64],
     is_near: NDArray[np.bool_], is_sound: NDArray[np.bool_], is_due: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
 
-    Bridges stay, and no label falls below its volume `least`. Afterwards no node is marked near; those with a fault
-    there or at an edge, or near a change, are no longer marked sound; and those remain due where mending may succeed.
+    Bridges stay, and labels keep within the `bounds` of their volumes, (2, K). Afterwards no node is marked near; those
+    with a fault there or at an edge, or near a change, are no longer marked sound; and those remain due where mending
+    may succeed.
     """
-    room = np.bincount(labels, dual.size, len(least)) - least
+    room = _room(dual, labels, bounds)
     while is_near.any():
         faces = _nonmanifold(dual, labels, is_near)[0]
         is_sound[is_near] = True
@@ -630,12 +649,18 @@ def _mend_near(
         _mend(dual, labels, room, is_bridge, faces, is_near, is_sound, is_due, _work(dual))
 
 
-def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
+def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Volumes that labels may lose and gain, (2, K), within the `bounds` of theirs."""
+    volume = np.bincount(labels, dual.size, bounds.shape[1])
+    return np.stack([volume - bounds[0], bounds[1] - volume])
+
+
+def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> None:
     """Mend the remaining places between two labels, even if that removes a bridge."""
     is_bridge, marks = np.zeros(len(labels), dtype=bool), np.zeros((3, len(dual.scale)), dtype=bool)
     for _ in range(MENDING_ROUNDS):
         faces, is_two = _nonmanifold(dual, labels)
-        before, room = labels.copy(), np.bincount(labels, dual.size, len(least)) - least
+        before, room = labels.copy(), _room(dual, labels, bounds)
         _mend(dual, labels, room, is_bridge, faces[is_two], *marks, _work(dual))
         if np.array_equal(before, labels):
             break
@@ -860,7 +885,7 @@ def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
 
 @entry
 def _mend(
-    dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, is_sound: Bools1,
+    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, is_near: Bools1, is_sound: Bools1,
     is_due: Bools1, work: _Work,
 ) -> None:  # fmt: skip
     """At each place that is not manifold, make the move that most lowers the energy including pinches.
@@ -879,17 +904,21 @@ def _mend(
             size = _group(dual, labels, a, b, star[:count], i, group)
             if size == 0 or is_bridge[group[:size]].any():
                 continue
-            if room[labels[group[0]]] < dual.size[group[:size]].sum():
+            volume = dual.size[group[:size]].sum()
+            if room[0, labels[group[0]]] < volume:
                 is_due[a] = True
                 continue
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, is_sound, work)
+            can_grow = room[1] >= volume
+            is_due[a] = is_due[a] or not can_grow.all()
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, is_sound, work)
             if new >= 0:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
             size = _group(dual, labels, a, b, star[:count], best_from, group)
             volume = dual.size[group[:size]].sum()
-            room[labels[group[0]]] -= volume
-            room[best_label] += volume
+            for label, gain in ((labels[group[0]], -volume), (best_label, volume)):
+                room[0, label] += gain
+                room[1, label] -= gain
             for cell in group[:size]:
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
@@ -928,14 +957,17 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
 
 @unit
 def _best_of_group(
-    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, is_sound: Bools1, work: _Work
+    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, can_grow: Bools1, is_sound: Bools1, work: _Work
 ) -> tuple[int, float]:
-    """The label in the star that lowers the energy most for the group, and the change: below `least`, or -1."""
+    """The label in the star that may grow and lowers the energy most for the group, and the change.
+
+    The label is -1 unless the change is below `least`.
+    """
     old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
     before, pinches = 0.0, 0.0
     for j in range(len(star)):
         new = labels[star[j]]
-        is_new = new != old and _touches(dual, labels, group, new)
+        is_new = new != old and can_grow[new] and _touches(dual, labels, group, new)
         for i in range(j):
             is_new = is_new and labels[star[i]] != new
         if not is_new:
