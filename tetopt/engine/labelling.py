@@ -38,7 +38,8 @@ TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, 
 # .65 (MNI152, 5,000 nodes), and ribs of a CT have half of theirs
 LEAST_FRACTION = 0.9
 MOST_FRACTION = 1.2  # of a label's volume that mending may reach; without, a slab of a third of its cells gets 1.7
-LAST_FRACTIONS = 0.05, 1.5  # the same two at the end, when the last pinches are mended
+# the same two at the end, while two labels have pinches: with the last pair alone, a ball of 46 cells loses a third
+LAST_FRACTIONS = (0.8, 1.35), (0.65, 1.5), (0.05, 3.0)
 UNFIT_FRACTION = 0.3  # of the volume of a label smaller than a cell: if its cells have no more, it is dropped
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
 COMPONENT_FRACTION = 0.5
@@ -56,6 +57,7 @@ BIAS_PER_LOSS = 3.0  # bias of a label over the fraction of its volume that it l
 MOST_BIAS = 0.4  # of a cell's volume, at most, which bounds the overlap that volume costs, unless
 SPARED_LOSS = 0.1  # the loss but for a tenth is more: a label that would lose half of its volume or more gets it back
 LEAST_SHARE = 0.05  # of a cell's volume: a label with less of it does not get the cell
+MOST_FILLED = 1.5  # of a label's volume: a larger cell does not become its only one
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 
@@ -133,10 +135,7 @@ def labelled(
     aim = np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64)
     if keeps_volumes:
         _balance(dual, aim)
-    labels = _given(dual, aim, voxel, components)
-    is_small = (np.bincount(labels, dual.size, len(aim)) < UNFIT_FRACTION * aim) & (aim < dual.size.mean())
-    _give_away(dual, labels, is_small[labels])
-    return labels
+    return _given(dual, aim, voxel, components)
 
 
 def _given(dual: Dual, aim: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
@@ -160,7 +159,10 @@ def _given(dual: Dual, aim: NDArray[np.float64], voxel: float, components: list[
         _settle(dual, labels, bounds[0], True)
         if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
             break
-    _mend_pairs(dual, labels, np.multiply.outer(LAST_FRACTIONS, aim))
+    is_unfit = (np.bincount(labels, dual.size, len(aim)) < UNFIT_FRACTION * aim) & (aim < dual.size.mean())
+    _give_away(dual, labels, is_unfit[labels])
+    for each in LAST_FRACTIONS:
+        _mend_pairs(dual, labels, np.multiply.outer(each, aim))
     return labels
 
 
@@ -180,14 +182,15 @@ def unpinched(
 
 
 def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
-    """Give each label without cells the cell with most of it, unless that has far more of others."""
+    """Give each label without cells the cell with most of it, unless that is too large or has far more of others."""
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
-    n_of = np.bincount(labels, minlength=len(dual.bias))
+    n_of, most = np.bincount(labels, minlength=len(dual.bias)), MOST_FILLED * np.bincount(dual.row, dual.volume)
     for label in np.setdiff1d(dual.row, labels):
         place = np.flatnonzero(dual.row == label)
         place = place[np.argmax(dual.volume[place])]
         best = cell[place]
-        if dual.volume[place] > LEAST_SHARE * dual.size[best] and n_of[labels[best]] > 1:
+        is_fit = dual.volume[place] > LEAST_SHARE * dual.size[best] and dual.size[best] <= most[label]
+        if is_fit and n_of[labels[best]] > 1:
             n_of[labels[best]] -= 1
             labels[best] = label
 
