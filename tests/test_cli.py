@@ -956,6 +956,17 @@ def test_sizes_make_the_number_of_nodes(tmp_path, inputs):
     assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == round(of_part + 0.75 * 16**3 / 8)
 
 
+def test_only_the_users_longest_edge_is_told_as_missed(tmp_path, inputs, monkeypatch, capsys):
+    """Not that of cells of order 2, which a run chooses itself."""
+    monkeypatch.setattr(tetopt.job.advice, "LENGTH_ROUNDING", -0.9)  # any edge is too long
+    command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
+    quadratic = ["--nodes", "300", "--iterations", "1", "--order", "2"]
+    for words, is_told in (([], False), (["--edge-max", "60"], True)):
+        assert exit_code(*command, *quadratic, *words, "--force") == 0
+        assert ("over --edge-max 60" in capsys.readouterr().err) == is_told
+        assert numbers_in(tmp_path / "a.json")["options"]["edge_max"] > 0.0
+
+
 def test_target_error(tmp_path, inputs, capfd):
     """As many nodes as it takes, told in the numbers; the same as asking for that many. A miss exits 1."""
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)

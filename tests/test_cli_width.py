@@ -21,11 +21,11 @@ def real_width(monkeypatch, wide_lines):
 
 @pytest.fixture
 def labels():
-    thick = Thickness(101.25, 1234.5, 12345.6)
+    thick = Thickness(101.25, 1234.5, 12345.6, 12345.6)
     rows = [
         LabelFidelity(
             100000 + k, 12345678, 1234567.89, 1234567.89, 123456, 0, 1.0 - 0.001 * k, 0.9, 123.456, 123.456, 12, 11,
-            False, 123.4, 0.5, 0.8, 12345678, (), thick, thick, 12.34, 12.34,
+            False, 123.4, 0.5, 0.8, 12345678, (), thick, thick, 12.34, 1.234,
         )
         for k in range(N_LABELS)
     ]  # fmt: skip

@@ -245,6 +245,16 @@ def test_components_of_a_mask_without_a_cell():
     np.testing.assert_allclose(row.place, place, atol=1e-3 * np.abs(place).max())
 
 
+def test_small_components_of_a_mask_may_be_lost_and_are_counted():
+    data = np.zeros((18, 18, 18))
+    data[2:10, 2:10, 2:10] = data[14:17, 14:17, 14:17] = 1.0
+    mask = tetopt.Image(data)
+    mesh = tetopt.lattice_mesh(mask, blocks=(9, 9, 9))
+    mesh = part_of(mesh, (centroids(mesh.points, mesh.cells) < 10.0).all(axis=1))
+    assert "components" not in judged(mesh, content(mask, mask=mask)).violated
+    assert [each.voxels for each in tetopt.mask_fidelity(mask, mesh).lost_components] == [27]
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
 def test_labels_are_given_and_judged_however_few_iterations_there_are(options):

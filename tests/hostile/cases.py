@@ -362,7 +362,17 @@ def texts_in_meshes(draw):
     """JSON, sets and loads that a mesh's file of ours states, as another may have written them."""
     name = draw.one("m.vtu", "solved.vtu")
     field = draw.one(
-        "box", "label_table", "loads", "sets", "options", "inputs", "reactions", "units", "space", "image_sha256"
+        "box",
+        "label_table",
+        "loads",
+        "sets",
+        "options",
+        "inputs",
+        "reactions",
+        "units",
+        "space",
+        "image_sha256",
+        "violated",
     )
     import base64
 

@@ -9,7 +9,7 @@ from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.requirements import LABEL_REMEDY
-from tetopt.job.advice import agreed, of_empty, of_result, of_sizes, sentences, tell, unmet
+from tetopt.job.advice import agreed, beyond_requirements, of_empty, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.start.sizes import EdgeRatios, Sizes
@@ -115,8 +115,29 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
     assert words.startswith("components of labels without a cell: 99 voxels of label 3 at (1, 2.5, 1235) mm, 99 voxels")
     assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {LABEL_REMEDY}")
     assert "no cell has label" not in said()  # named above
+    small = [label_of(3)._replace(lost_components=tuple(each._replace(voxels=49) for each in lost))]
+    assert told(*unmet({}, {"labels": small})) == {}
     large = [label_of(4, is_lost=True, voxels=200)._replace(lost_components=lost[:2])]
     assert "components" not in told(*unmet({}, {"labels": large}))["labels"]
+
+
+def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
+    lost = tuple(LostComponent(n, (1.0, 2.5, 3.0)) for n in (40, 3))
+    rows = [label_of(k, 9.0 * ratio) for k, ratio in enumerate((0.5, 0.86, 0.8, 1.14, 1.3, 0.1, 0.84, 1.2))]
+    assert beyond_requirements([rows[1], rows[3]], {}) == ""
+    assert beyond_requirements([], {}) == ""
+    rows[1] = rows[1]._replace(lost_components=lost, components=9, mesh_components=7)
+    rows[3] = rows[3]._replace(lost_components=lost[:1], components=2, mesh_components=2)
+    rows[5] = rows[5]._replace(lost_components=lost[1:], components=1, mesh_components=1)  # its cell is elsewhere
+    rows[7] = rows[7]._replace(mesh_components=3)
+    rows[0] = rows[0]._replace(lost_components=lost, mesh_components=5)  # the space between tissues
+    assert beyond_requirements(rows, {5: "rib"}) == (
+        "labels: of 8, 6 with less than 0.85 or more than 1.15 times the volume of their voxels: "
+        "5 (rib) (0.1), 0 (0.5), 4 (1.3), 2 (0.8), 7 (1.2) and 1 more; "
+        "3 with components without a cell: "
+        "1 (2 of 9, voxels: 43), 3 (1 of 2, voxels: 40), 5 (rib) (1 of 1, voxels: 3); "
+        "2 with more pieces of cells than of voxels: 7 (3), 3 (2)"
+    )
 
 
 def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
@@ -217,3 +238,9 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     assert numbers["violated"] == {}
     n_nodes, n_cells = (numbers["size"][name] for name in ("n_nodes", "n_cells"))
     assert f"reduce --nodes to about {float(f'{n_nodes * (1 - n_empty / n_cells):.2g}'):.0f}" in err
+    halves = tmp_path / "halves.nii.gz"
+    tetopt.save_image(halves, tetopt.Image(np.indices((20, 20))[0] // 10 + 1.0))
+    assert exit_code(*command, "--labels", halves, "--force") == 0
+    err = capsys.readouterr().err
+    assert "contain no voxel centre" in err
+    assert "reduce" not in err  # interfaces make such cells, and labels need nodes

@@ -16,6 +16,7 @@ from tetopt.job.advice import Problem, agreed, of_layers, sentences
 from tetopt.measure.fidelity import LabelFidelity
 
 COARSE = ["--spacing", "12", "--iterations", "0"]
+FINE = ["--spacing", "6", "--iterations", "0"]
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,39 @@ def test_a_good_mesh_ends_with_a_verdict(inputs, tmp_path, capsys):
     assert "warning" not in said.err
     assert exit_code("quality", out, "--image", inputs / "a.nii.gz", "--check") == 0
     assert capsys.readouterr().out.splitlines()[-1] == words
+
+
+def test_a_verdict_is_not_without_what_requirements_allow(tmp_path, capsys):
+    """A label of 180 voxels whose cells are too large for it, and a speck of another without a cell."""
+    labels = np.ones((24, 24, 24))
+    labels[8:13, 8:14, 8:14], labels[3, 3, 3], labels[16:, 16:, 16:] = 2.0, 3.0, 3.0
+    tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels))
+    out, path = tmp_path / "a.vtu", tmp_path / "a.json"
+    files = ["--labels", tmp_path / "l.nii.gz"]
+    assert exit_code("mesh", tmp_path / "l.nii.gz", *files, "-o", out, "--json", path, *FINE) == 0
+    rows = {row["label"]: row for row in numbers_in(path)["labels"]}
+    assert [each["voxels"] for each in rows[3]["lost_components"]] == [1]
+    *_, beyond, verdict = capsys.readouterr().out.replace("\n  ", " ").splitlines()
+    ratio = rows[2]["mesh_volume"] / 180.0
+    assert not 0.85 <= ratio <= 1.15
+    assert beyond.startswith("labels: of 3, ")
+    assert f"2 ({ratio:.2g})" in beyond
+    assert beyond.endswith("1 with components without a cell: 3 (1 of 2, voxels: 1)")
+    assert verdict.startswith(f"all requirements are met, but not all labels fit (above); {out}: ")
+    assert exit_code("quality", out, "--image", tmp_path / "l.nii.gz", *files, "--check") == 0
+    assert capsys.readouterr().out.replace("\n  ", " ").splitlines()[-2:] == [beyond, verdict]
+
+
+def test_commands_tell_that_the_run_of_a_mesh_violated_requirements(inputs, tmp_path, capsys):
+    mesh = tmp_path / "a.vtu"
+    assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *CASES["error"][0]) == 1
+    for source, out in ((mesh, tmp_path / "b.vtu"), (tmp_path / "b.vtu", tmp_path / "c.inp")):  # also of a copy
+        capsys.readouterr()
+        assert exit_code("convert", source, out, "--young", "1") == 0
+        assert "the run that built this mesh violated requirements: error" in capsys.readouterr().err
+    assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *COARSE, "--force") == 0
+    assert exit_code("convert", mesh, tmp_path / "d.vtu") == 0
+    assert "violated" not in capsys.readouterr().err
 
 
 def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypatch, capsys):

@@ -79,6 +79,15 @@ def test_the_outside_is_no_label_but_is_around():
     assert broken(label_interfaces(image, alone, np.ones(only.sum()))[1]) == (1, 1, 0, 0)
 
 
+def test_areas_are_those_of_closed_surfaces():
+    """With their faces on the box, in the mesh and in the voxels."""
+    labels = np.ones((10, 10, 10))
+    labels[:, :5] = 2
+    for row in label_interfaces(*blocky(labels)):
+        assert row.area == pytest.approx(400.0)
+        assert row.area_ratio == pytest.approx(1.2, abs=0.05)  # nets round edges
+
+
 def test_a_void_that_the_mesh_leaves_out_is_a_cavity():
     """A shell around a void of the mask, with an island in it; beside it a block with a cavity of label 0."""
     labels = np.ones((7, 7, 12))

@@ -115,7 +115,7 @@ def test_a_shell_between_facets_is_as_thick_as_it_is(size, spacing, monkeypatch)
 def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
     image, mesh, of_cell = blocky(slabs(size, n))
     voxels, cells = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
-    assert cells == pytest.approx((size,) * 3, abs=1e-4)
+    assert cells == pytest.approx((size, size, size, 10.0), abs=1e-4)
     assert voxels == pytest.approx(cells, rel=0.03)
 
 
@@ -139,7 +139,7 @@ def test_percentiles_are_over_the_voxels():
     size = np.choose(np.searchsorted([6, 16], y, side="right"), [2, 4, 6])
     image, mesh, of_cell = blocky(np.where((x >= 6) & (x < 6 + size), 2, 1))
     for each in label_thickness(tetopt.content(image, image), mesh, of_cell)[2]:
-        assert each == pytest.approx((2.0, 4.0, 6.0), abs=0.5)
+        assert each == pytest.approx((2.0, 4.0, 6.0, 10.0), abs=0.5)
 
 
 def test_a_label_that_is_in_one_of_them_alone():
@@ -174,7 +174,7 @@ def texts(table):
 
 def test_tables_have_the_worst_five_alone():
     rows = [
-        LabelFidelity(*(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0), None)._replace(
+        LabelFidelity(*(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0, 3.0), None)._replace(
             label=label
         )
         for label, fraction in zip(range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True)
@@ -186,15 +186,23 @@ def test_tables_have_the_worst_five_alone():
         texts(thin_table([rows[0]._replace(label=0, one_layer_fraction=1.0), *rows], {rows[0].label: "bone [l]"}))
         == shown
     )
-    assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "2.00 (1.00 to 3.00)", "-", "-", "-")
+    assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "2.00 (1.00 to >= 3.00)", "-", "-", "-")
     alike = [row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)) for row in rows]
     assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
+    thick = rows[0]._replace(one_layer_fraction=1.0)
+    for row in (thick._replace(cells_across=2.0), thick._replace(thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0))):
+        assert texts(thin_table([row, *rows], {rows[0].label: "bone [l]"})) == shown
+        assert thin_table([row], {}) is None
     contacts = [LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)]
     contacts += [LabelContact((2, 3), 90.0, 0.0, np.nan), LabelContact((2, 4), 149.0, 100.0, 1.49)]
     shown = texts(contact_table(contacts, {3: "fluid"}, 2))
     assert shown[0] == ("2, 3 fluid", "90.0", "0.0", "false")
     assert [row[0] for row in shown[1:]] == ["1, 2", "1, 3 fluid", "1, 4", "1, 5"]
     assert contact_table(contacts[-1:], {}, 3) is None
+    small, large = LabelContact((7, 8), 25.0, 1.0, 25.0), LabelContact((7, 9), 40.0, 10.0, 4.0)
+    shown = texts(contact_table([*contacts, small, large], {}, 2))
+    assert [row[0] for row in shown] == ["2, 3", "1, 2", "1, 3", "1, 4", "7, 9"]
+    assert texts(contact_table([small, large], {}, 2))[0][0] == "7, 9"
     words = contacts_in_words(contact_totals(contacts[-2:]), 2)
     assert words == (
         "contact beyond 1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels that do not touch in "

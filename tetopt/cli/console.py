@@ -209,10 +209,17 @@ def warnings_once() -> Callable[..., None]:
     return show
 
 
-def print_verdict(violated: Iterable[str], words: str, which: str = "all requirements") -> None:
-    """Print the last line of a command: whether the mesh meets the requirements, and the mesh in words."""
+def print_verdict(
+    violated: Iterable[str], words: str, measured: dict[str, Any], which: str = "all requirements"
+) -> None:
+    """Print the last lines of a command: what requirements allow of labels, whether they are met, the mesh in words."""
+    from tetopt.job.advice import beyond_requirements  # imports numba
+
     names = ", ".join(violated)
-    print_line(f"requirements not met: {names}; {words}" if names else f"{which} are met; {words}")
+    if beyond := beyond_requirements(measured.get("labels", []), measured.get("label_names", {})):
+        print_line(beyond)
+    met = f"{which} are met" + (", but not all labels fit (above)" if beyond else "")
+    print_line(f"requirements not met: {names}; {words}" if names else f"{met}; {words}")
 
 
 def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False) -> None:

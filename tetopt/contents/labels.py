@@ -34,7 +34,6 @@ LABEL_PALETTE = (
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
 LABEL_TINTS = (0.0, -0.4, 0.4)  # variants of the palette as it repeats: unchanged, mixed with black, mixed with white
-COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
 BACKGROUND_LABEL = 0  # the label outside all tissues
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
@@ -96,7 +95,7 @@ def _neighbours(data: NDArray, axis: int) -> tuple[NDArray, NDArray]:
 
 
 class LostComponent(NamedTuple):
-    """A face-connected component of a label's or mask's voxels, of 50 or more, none of which lies in a cell of it.
+    """A face-connected component of a label's or mask's voxels, none of which lies in a cell of it.
 
     Parameters
     ----------
@@ -118,14 +117,14 @@ class LostComponent(NamedTuple):
 def voxel_components(
     inside: NDArray[np.bool_], is_met: NDArray[np.bool_], affine: NDArray[np.float64], box: Sequence[slice] = ()
 ) -> tuple[int, tuple[LostComponent, ...]]:
-    """Number of face-connected components of voxels, and large ones without one that `is_met`, the largest first.
+    """Number of face-connected components of voxels, and those without one that `is_met`, the largest first.
 
     The voxels are in a `box` of the grid with this affine, by default at its corner.
     """
     start = [side.start for side in box] or 0
     number, n_components = scipy.ndimage.label(inside)
     sizes, met = (np.bincount(number[which], minlength=n_components + 1) for which in (inside, inside & is_met))
-    lost = np.flatnonzero((sizes >= COMPONENT_VOXELS) & (met == 0))
+    lost = np.flatnonzero((sizes > 0) & (met == 0))
     boxes = scipy.ndimage.find_objects(number) if len(lost) else []
     rows = []
     for component in lost[np.argsort(-sizes[lost], kind="stable")].tolist():

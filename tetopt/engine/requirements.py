@@ -33,6 +33,7 @@ from tetopt.mesh import Mesh
 
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
+COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
 COMPONENTS_LISTED = 5  # of those without a cell
@@ -193,7 +194,8 @@ def _violated_components(content: Content, region: Region, mesh: Mesh, owner: ND
     if len(n_cells) > max(n_mask, 1):
         words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
         texts.append(f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells")
-    texts += [f"components of the mask without a cell: {_listed([(each, '') for each in lost])}"] if lost else []
+    large = [(each, "") for each in lost if each.voxels >= COMPONENT_VOXELS]
+    texts += [f"components of the mask without a cell: {_listed(large)}"] if large else []
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
@@ -230,8 +232,9 @@ class LabelFit(NamedTuple):
 
     @property
     def pieces(self) -> tuple[LostComponent, ...]:
-        """The components of a tissue that has cells elsewhere; those of the space between tissues do not count."""
-        return () if self.is_lost or self.label == BACKGROUND_LABEL else self.components
+        """The large ones of a tissue that has cells elsewhere; those of the space between tissues do not count."""
+        is_exempt = self.is_lost or self.label == BACKGROUND_LABEL
+        return () if is_exempt else tuple(each for each in self.components if each.voxels >= COMPONENT_VOXELS)
 
 
 def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:

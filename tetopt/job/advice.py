@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from tetopt.model.labels import label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
+NEAR_VOLUME = (0.85, 1.15)  # of a label's cells, over its voxels': other volumes are told beside the verdict
 VOLUME_RATIO = 2.0  # of a label's cells to its voxels, or the other way round: more is reported
 LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represent the label
 NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
@@ -124,7 +125,7 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     """
     labels, pockets = measured.get("labels", []), {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {}
     words = {row.label: label_words(row.label, measured.get("label_names", {}) | pockets) for row in labels}
-    ratios = {row: row.mesh_volume / row.volume * row.voxels / max(row.covered_voxels, 1) for row in labels}
+    ratios = {row: row.volume_ratio for row in labels}
     fits = {
         row: LabelFit(row.label, row.covered_voxels, ratio, row.dice > 0.0, row.lost_components)
         for row, ratio in ratios.items()
@@ -154,6 +155,35 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
         yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
 
 
+def beyond_requirements(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> str:
+    """Describe what requirements allow of labels: another volume, lost components, more pieces; empty if there is none.
+
+    Each is counted, and the worst are named, among all labels; of label 0, only the volume counts.
+    """
+    low, high = NEAR_VOLUME
+    faults: dict[str, list[tuple[float, str]]] = {
+        f"with less than {low:g} or more than {high:g} times the volume of their voxels": [],
+        "with components without a cell": [],
+        "with more pieces of cells than of voxels": [],
+    }
+    off, lost, split = faults.values()
+    for row in rows:
+        ratio, voxels = row.volume_ratio, sum(each.voxels for each in row.lost_components)
+        n_lost, words = len(row.lost_components), label_words(row.label, names)
+        if row.covered_voxels and not low <= ratio <= high:
+            off.append((min(ratio, 1.0 / max(ratio, low)), f"{words} ({ratio:.2g})"))
+        if row.label != BACKGROUND_LABEL and n_lost:
+            lost.append((-voxels, f"{words} ({n_lost} of {row.components}, voxels: {voxels})"))
+        if row.label != BACKGROUND_LABEL and row.mesh_components > max(row.components - n_lost, 1):
+            split.append((-row.mesh_components, f"{words} ({row.mesh_components})"))
+    texts = [
+        f"{len(some)} {what}: {listed([each[1] for each in sorted(some, key=lambda each: each[0])], 5)}"
+        for what, some in faults.items()
+        if some
+    ]
+    return f"labels: of {len(rows)}, {'; '.join(texts)}" if texts else ""
+
+
 def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
     if mask is None:
         return
@@ -180,7 +210,7 @@ def of_result(
         text = f"{n_nodes} nodes instead of {nodes}"
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
             remedy = "set `nodes` to that, or use larger sizes"
-            yield Problem(f"{text}: the target sizes need about {needed}", remedy)
+            yield Problem(f"{text}: the target sizes need about {needed}", remedy, wants="smaller")
         elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
             yield Problem(f"{text}: most cells contain no voxel centre", wants="larger")
         elif result.history[-1].iteration == 0:

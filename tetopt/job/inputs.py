@@ -269,6 +269,8 @@ def read_mesh(path: Path) -> MeshFile:
         note(f"{path}: dropped {loaded.n_left} cells of lower dimension")
     for line in loaded.notes:
         note(f"{path}: {line}")
+    if violated := loaded.table("violated"):
+        warning(f"{path}: the run that built this mesh violated requirements: {listed(list(violated))}")
     return loaded
 
 

@@ -44,7 +44,6 @@ from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_b
 from tetopt.system.files import check_space, kept_places
 
 CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
-LONG_SECONDS = 3.0  # above it, the kernels were compiled, not loaded
 FIRST_TOLD = 3  # iteration after which the time left is told: the first ones, with most exchanges, take longer
 PACE_OF = 2  # iterations: the last ones, by which it is estimated
 START_WORDS = "building the initial mesh"
@@ -135,12 +134,8 @@ def _aim(task: Task) -> Aim:
 
 def _prepare(task: Task) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
-    begin, mode = time.perf_counter(), task.plan.mode
-    content, k_D = task.source.content, task.plan.engine_options["k_D"]
+    content, k_D, mode = task.source.content, task.plan.engine_options["k_D"], task.plan.mode
     prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
-    seconds = time.perf_counter() - begin
-    if seconds > LONG_SECONDS:
-        note(f"kernels compiled in {seconds:.0f} s; later runs on similar images load them from the cache")
 
 
 def watched(
@@ -192,12 +187,12 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
         fraction = unexplained_by(content, result.mesh, result.history[-1])
         note(
             f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance unexplained; "
-            f"accepted: {ERROR_REACHED * target:.4g} to {target:.4g}"
+            f"aim: {ERROR_REACHED * target:.4g} to {target:.4g}"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
-            f"run {number} of up to {NODE_RUNS}: {n_nodes} of {job.nodes} nodes, including mid-edge "
-            f"nodes; accepted: within {NODES_NEAR:.0%}"
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} of {job.nodes} nodes, including mid-edge nodes, "
+            f"{abs(n_nodes / job.nodes - 1.0):.1%} off; aim: {NODES_NEAR:.0%} or less"
         )
 
 

@@ -180,11 +180,14 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
     n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
-    empty = list(of_empty(outcome.result, None if mode == "start" else n_nodes, n_empty, spacing))
-    problems = [*empty, *problems] if has_most_empty(outcome.result, n_empty) else [*problems, *empty]
+    is_most = has_most_empty(outcome.result, n_empty)  # else fewer nodes hardly help cells that follow labels
+    is_free = mode != "start" and (is_most or task.source.labels is None)
+    empty = list(of_empty(outcome.result, n_nodes if is_free else None, n_empty, spacing))
+    problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
     problems += of_result(outcome.result, job.method, mode, n_nodes, expected, measured)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
-        problems += of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
-    return agreed(problems)
+        sizes = task.sizes._replace(longest=task.plan.bare.edge_max)  # without a default
+        problems += of_sizes(sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
+    return agreed(problems if is_most else [*problems, *empty])

@@ -76,6 +76,7 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
     if job.target_error is not None:
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
+    about |= {"violated": result.violated} if result.violated else {}
     places = islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
     early = None if outcome.end is not None else keep_early(result.mesh, result.labels, places)
     if fields is None:

@@ -57,6 +57,8 @@ class Thickness(NamedTuple):
     ----------
     p5, p50, p95 : float
         The 5th percentile, the median and the 95th percentile over the voxel centres in the label, mm.
+    limit : float
+        Thickness beyond this is clipped, mm.
 
     Examples
     --------
@@ -67,6 +69,7 @@ class Thickness(NamedTuple):
     p5: float
     p50: float
     p95: float
+    limit: float = np.inf
 
 
 class LabelFidelity(NamedTuple):
@@ -109,7 +112,7 @@ class LabelFidelity(NamedTuple):
     covered_voxels : int
         Number of its voxels that cells should represent: those in the mesh or, with a mask, all.
     lost_components : tuple of LostComponent
-        Components of 50 of these voxels or more, none of which lies in a cell with the label.
+        Components of these voxels, none of which lies in a cell with the label, the largest first.
     thickness_voxels, thickness_mesh : Thickness, optional
         Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
         measured.
@@ -150,6 +153,11 @@ class LabelFidelity(NamedTuple):
     edge: float = np.nan
     cells_across: float = np.nan
 
+    @property
+    def volume_ratio(self) -> float:
+        """Ratio of the volume of its cells to that of its voxels that they should represent."""
+        return self.mesh_volume / self.volume * self.voxels / max(self.covered_voxels, 1)
+
 
 class MaskFidelity(NamedTuple):
     """Fidelity of a mesh to the mask that it should fill. Volumes are areas in 2-D.
@@ -182,7 +190,7 @@ class MaskFidelity(NamedTuple):
     mesh_euler : int
         Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends there has 1.
     lost_components : tuple of LostComponent
-        Components of 50 voxels or more, none of which lies in a cell.
+        Components of these voxels, none of which lies in a cell, the largest first.
 
     Examples
     --------

@@ -45,9 +45,9 @@ class LabelInterface(NamedTuple):
     label : int
         The label's number.
     area : float
-        Area of its surface in the mesh, mm^(n-1).
+        Area of its closed surface in the mesh, with its faces on the image's box or a mask's surface, mm^(n-1).
     smooth_area : float
-        Area of the smooth surface of its voxels, mm^(n-1).
+        Area of the closed smooth surface of its voxels, mm^(n-1).
     area_ratio : float
         Ratio of the two; nan without cells, or with fewer voxels than `NET_VOXELS`.
     folded : float

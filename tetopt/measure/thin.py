@@ -201,14 +201,14 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     spacing = np.asarray(grid.spacing, dtype=np.float64)
     rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     thick = local_thickness(members, spacing, most, inside)
-    of_voxels = _percentiles(thick, rows, members.labels)
+    of_voxels = _percentiles(thick, rows, members.labels, most)
     values, row = np.unique(of_cell, return_inverse=True)
     owner = cell_of_voxel(grid, mesh)
     rows = np.where(owner >= 0, row[owner], BEYOND_REGION)
     shared = facets(mesh.cells)
     is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
     corners = (grid.to_index(mesh.points) * spacing)[shared.nodes[is_between]]
-    of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values)
+    of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values, most)
     is_right = (owner >= 0) & (members.labels[members.partition] == of_cell[owner])
     is_right &= True if inside is None else inside
     edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)[owner[is_right]]
@@ -231,12 +231,13 @@ def _medians(label: NDArray[np.int64], values: NDArray[np.floating]) -> dict[int
 
 
 def _percentiles(
-    thickness: NDArray[np.float32], rows: NDArray[np.int64], values: NDArray[np.int64]
+    thickness: NDArray[np.float32], rows: NDArray[np.int64], values: NDArray[np.int64], most: float
 ) -> dict[int, Thickness]:
     """Percentiles of the thickness at the voxels of each row, by label."""
     percentiles = {}
     for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
         if box is not None:
             own = thickness[box][rows[box] == row]
-            percentiles[int(values[row])] = Thickness(*np.percentile(own, THICKNESS_PERCENTILES).astype(float).tolist())
+            three = np.percentile(own, THICKNESS_PERCENTILES).astype(float).tolist()
+            percentiles[int(values[row])] = Thickness(*three)._replace(limit=float(np.float32(most)))
     return percentiles

@@ -27,7 +27,7 @@ from tetopt.system.incoming import json_of
 MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # cell data in tetopt's files
 MODULUS_ROUNDING = 1e-9  # relative, between a cell's modulus and those at its Gauss points, in files of other units
 MASK_TEXT = "mask"  # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", MASK_TEXT)  # those that are kept in a new file
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)  # those that are kept in a new file
 
 
 class MeshFile(NamedTuple):

@@ -24,6 +24,8 @@ WORST_ROWS = 5  # thin labels and pairs shown; run.json has all
 WORST_LABELS = 12  # the same of labels
 LONGEST_NAME = 24  # of a label with its number, characters
 TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
+SOME_CONTACT = 0.25  # of the last contact shown: that of the largest ratio has as much, or is too small to matter
+THIN_ACROSS = 2.0  # cells: labels with fewer are thin
 LARGE_SIZE = 1e4  # mm3 or mm2: larger labels are shown without decimals
 
 
@@ -204,9 +206,13 @@ def _decimals(number: float, count: int) -> str:
 def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table | None:
     """Return a table of the `WORST_ROWS` labels with the largest one-layer fraction, worst first, then thinnest.
 
-    Label 0 is not a tissue and is omitted, as are labels without a thickness; None if none is left.
+    Label 0 is not a tissue and is omitted, as are labels without a thickness, or with a median at its limit, or with
+    `THIN_ACROSS` cells across or more; None if none is left.
     """
-    there = [row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL and row.thickness_voxels is not None]
+    there = [
+        row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL and not row.cells_across >= THIN_ACROSS
+        and row.thickness_voxels is not None and row.thickness_voxels.p50 < row.thickness_voxels.limit
+    ]  # fmt: skip
     if not there:
         return None
     table = _table_of_labels(
@@ -225,13 +231,19 @@ def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table
 
 
 def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], ndim: int) -> Table | None:
-    """Return a table of pairs with over 1.5 times the contact of the voxels, largest excess first; None if empty."""
+    """Return a table of pairs with over 1.5 times the contact of the voxels, largest excess first; None if empty.
+
+    The last one is that of the largest ratio, unless it is among the others or its area is small.
+    """
     more = [each for each in contacts if each.mesh_mm2 > TOLD_CONTACT * each.voxels_mm2]
     if not more:
         return None
     unit = "mm2" if ndim == 3 else "mm"
     table = new_table("contact", f"of cells, {unit}", f"of voxels, {unit}", "ratio")
-    for each in sorted(more, key=lambda each: each.voxels_mm2 - each.mesh_mm2)[:WORST_ROWS]:
+    shown = sorted(more, key=lambda each: each.voxels_mm2 - each.mesh_mm2)[:WORST_ROWS]
+    large = [each for each in more if each.voxels_mm2 and each.mesh_mm2 >= SOME_CONTACT * shown[-1].mesh_mm2]
+    worst = max(large, key=lambda each: each.ratio, default=shown[-1])
+    for each in shown if worst in shown else [*shown[:-1], worst]:
         words = ", ".join(_label_words(label, names) for label in each.labels)
         ratio = _decimals(each.ratio, 2) if each.voxels_mm2 else "false"
         table.add_row(words, size_text(each.mesh_mm2, 1), size_text(each.voxels_mm2, 1), ratio)
@@ -251,7 +263,7 @@ def _percentiles_text(thickness: Thickness | None) -> str:
     """Return the median, and in brackets the 5th and 95th percentile."""
     if thickness is None:
         return "-"
-    low, middle, high = (size_text(mm, 2) for mm in thickness)
+    low, middle, high = (">= " * (mm >= thickness.limit) + size_text(mm, 2) for mm in thickness[:3])
     return f"{middle} ({low} to {high})"
 
 
