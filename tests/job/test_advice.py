@@ -244,3 +244,9 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "contain no voxel centre" in err
     assert "reduce" not in err  # interfaces make such cells, and labels need nodes
+    sizes = ["mesh", path, "--edge-size", "1.6", "--nodes", "200", "--iterations", "2", "-o", tmp_path / "b.vtu"]
+    assert exit_code(*sizes) == 0
+    err = capsys.readouterr().err
+    assert "sizes require about 3" in err
+    assert "contain no voxel centre" in err
+    assert "reduce" not in err

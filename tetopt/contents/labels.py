@@ -124,16 +124,15 @@ def voxel_components(
     start = [side.start for side in box] or 0
     number, n_components = scipy.ndimage.label(inside)
     sizes, met = (np.bincount(number[which], minlength=n_components + 1) for which in (inside, inside & is_met))
-    lost = np.flatnonzero((sizes > 0) & (met == 0))
-    boxes = scipy.ndimage.find_objects(number) if len(lost) else []
-    rows = []
-    for component in lost[np.argsort(-sizes[lost], kind="stable")].tolist():
-        near = boxes[component - 1]
-        index = np.argwhere(number[near] == component) + [side.start for side in near]
-        middle = index[np.argmin(((index - index.mean(axis=0)) ** 2).sum(axis=1))] + start
-        place = transformed(middle, affine[:-1, :-1]) + affine[:-1, -1]
-        rows.append(LostComponent(int(sizes[component]), tuple(place.tolist())))
-    return n_components, tuple(rows)
+    index = np.argwhere(((sizes > 0) & (met == 0))[number])
+    of_voxel = number[tuple(index.T)]
+    sums = np.column_stack([np.bincount(of_voxel, along, n_components + 1) for along in index.T])
+    middle = sums / np.maximum(sizes, 1)[:, None]
+    order = np.lexsort((((index - middle[of_voxel]) ** 2).sum(axis=1), of_voxel, -sizes[of_voxel]))
+    near = order[np.sort(np.unique(of_voxel[order], return_index=True)[1])]  # the first of each
+    places = transformed(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
+    rows = zip(sizes[of_voxel[near]].tolist(), places.tolist(), strict=True)
+    return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
 
 
 def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:

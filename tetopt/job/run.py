@@ -182,6 +182,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
     is_most = has_most_empty(outcome.result, n_empty)  # else fewer nodes hardly help cells that follow labels
     is_free = mode != "start" and (is_most or task.source.labels is None)
+    is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
     empty = list(of_empty(outcome.result, n_nodes if is_free else None, n_empty, spacing))
     problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
