@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import numbered_edges
+from tetopt.geometry.quadratic import curved_volumes, numbered_edges, quadratic, straight_pieces
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
@@ -36,8 +36,8 @@ class Mesh:
         right-handed frame. Read-only.
     midpoints : (E, n) array of float64, optional
         Mid-edge nodes, mm, of quadratic cells whose edges may be curved, in the order of
-        `tetopt.geometry.quadratic.numbered_edges`, sorted by their ends. Without them edges are straight. Linear cells
-        and all measures and pictures of a mesh use only the corners. Read-only.
+        `tetopt.geometry.quadratic.numbered_edges`, sorted by their ends. Without them edges are straight. Linear cells,
+        sampling of images and conversions use only the corners (docs/understand/order.md). Read-only.
 
     Raises
     ------
@@ -87,13 +87,44 @@ class Mesh:
         """Number of space dimensions n, 2 or 3."""
         return self.points.shape[1]
 
+    @property
+    def cell_volumes(self) -> NDArray[np.float64]:
+        """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved edges."""
+        if self.midpoints is None:
+            return volumes(self.points, self.cells)
+        return curved_volumes(*quadratic(self.points, self.cells, self.midpoints))
+
+    def straight_pieces(self) -> tuple[Mesh, int]:
+        """Split cells with curved edges into straight ones, on which surfaces and overlaps are measured.
+
+        Returns
+        -------
+        mesh : Mesh
+            The mesh itself if its edges are straight. Otherwise each cell becomes 8 (in 2-D 4), in its place, with the
+            midpoints as nodes after the corners; a cell that is folded becomes straight.
+        n_pieces : int
+            Number of pieces of each cell: piece ``k`` belongs to cell ``k // n_pieces``.
+
+        Examples
+        --------
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], [[0.5, -0.1], [0, 0.5], [0.5, 0.5]])
+        >>> pieces, n_pieces = mesh.straight_pieces()
+        >>> n_pieces, [round(float(each.cell_volumes.sum()), 4) for each in (mesh, pieces)]
+        (4, [0.5667, 0.55])
+        """
+        if self.midpoints is None:
+            return self, 1
+        points, cells = straight_pieces(self.points, self.cells, self.midpoints)
+        return Mesh(points, cells), len(cells) // len(self.cells)
+
     def __repr__(self) -> str:
         kind = "tetrahedra" if self.ndim == 3 else "triangles"
         return f"Mesh({len(self.points)} nodes, {len(self.cells)} {kind}, {notebook.extent_words(self.points)})"
 
     def _repr_html_(self) -> str:
         """Numbers and the middle section, for a notebook."""
-        picture = notebook.section_html(self.points, self.cells)
+        pieces = self.straight_pieces()[0]
+        picture = notebook.section_html(pieces.points, pieces.cells)
         return notebook.card_html("Mesh", notebook.mesh_rows(self.points, self.cells), picture)
 
     def plot(
@@ -106,7 +137,7 @@ class Mesh:
         off_screen: bool | None = None,
         **look: Any,
     ) -> Any:
-        """Show the mesh in 3-D with pyvista: in a window, in a notebook, or as a picture.
+        """Show the mesh in 3-D with pyvista, with straight edges: in a window, in a notebook, or as a picture.
 
         Parameters
         ----------
@@ -156,7 +187,7 @@ class Mesh:
         return conversions.show_grid(grid, next(iter(colours), None), screenshot, off_screen, look)
 
     def to_pyvista(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> pyvista.UnstructuredGrid:
-        """Convert the mesh to pyvista, with data; a 2-D mesh lies in the plane z = 0.
+        """Convert the mesh to pyvista, with straight edges and data; a 2-D mesh lies in the plane z = 0.
 
         Parameters
         ----------
@@ -216,7 +247,7 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_meshio(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> meshio.Mesh:
-        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra.
+        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra with straight edges.
 
         Parameters
         ----------
@@ -271,7 +302,7 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_skfem(self) -> skfem.Mesh:
-        """Convert the mesh to scikit-fem; `Model.to_skfem` includes the sets.
+        """Convert the mesh to scikit-fem, with straight edges; `Model.to_skfem` includes the sets.
 
         Returns
         -------
@@ -321,7 +352,7 @@ class Mesh:
         return cls(picked.points, picked.cells)
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """Convert the boundary of a 3-D mesh to trimesh, as it is in the mesh.
+        """Convert the boundary of a 3-D mesh to trimesh, as it is in the mesh, with straight edges.
 
         Where cells touch only in an edge or a node, it is not a manifold; `tetopt.extract_surface` parts them.
 

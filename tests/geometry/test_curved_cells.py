@@ -81,3 +81,78 @@ def test_midpoints_that_a_mesh_does_not_take():
     with pytest.raises(tetopt.InputError, match="expected an array of numbers"):
         tetopt.Mesh(points, cells, "middle")
     assert tetopt.Mesh(points, cells).midpoints is None
+
+
+def test_volumes_of_curved_cells_in_closed_form():
+    """A midpoint moved by d adds the integral of d . grad(4 a b): to a triangle 2/3 of its edge times the height."""
+    triangle = tetopt.Mesh([[0, 0], [3, 0], [0, 1]], [[0, 1, 2]], [[1.5, -0.3], [0, 0.5], [1.5, 0.5]])
+    assert triangle.cell_volumes[0] == pytest.approx(1.5 + 2.0 / 3.0 * 3.0 * 0.3, rel=1e-14)
+    corners, cells = np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]]
+    middles = corners[numbered_edges(np.array(cells))[0]].mean(axis=1)
+    for edge, gradient in ((0, (0, -1, -1)), (5, (0, 1, 1))):  # between 0 and 1, and between 2 and 3
+        moved = middles.copy()
+        moved[edge] += (0.05, -0.1, 0.02)
+        expected = (1.0 + np.dot(gradient, (0.05, -0.1, 0.02))) / 6.0
+        assert tetopt.Mesh(corners, cells, moved).cell_volumes[0] == pytest.approx(expected, rel=1e-14)
+    assert tetopt.Mesh(corners, cells).cell_volumes[0] == pytest.approx(1.0 / 6.0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_volumes_of_curved_cells_by_another_rule(n):
+    """That of Gauss on the cube, folded onto the simplex (Duffy 1982), for cells with all edges bent."""
+    mesh = with_bent_edges(ball_mesh(n), 0.08)
+    nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
+    at, weights = np.polynomial.legendre.leggauss(4)
+    places, total = [], []
+    for powers in product(range(4), repeat=n):
+        rest, size, place = 1.0, 1.0, []
+        for axis, k in enumerate(powers):
+            along = 0.5 * (1.0 + at[k])
+            place.append(rest * along)
+            size *= 0.5 * weights[k] * (1.0 - along) ** (n - 1 - axis)
+            rest *= 1.0 - along
+        places.append([rest, *place])
+        total.append(size)
+    straight = tetopt.Mesh(mesh.points, mesh.cells).cell_volumes
+    expected = straight * (jacobian_ratios(nodes, cells, np.array(places)) @ total) * factorial(n)
+    np.testing.assert_allclose(mesh.cell_volumes, expected, rtol=1e-12)
+    assert np.abs(mesh.cell_volumes / straight - 1.0).max() > 0.05
+    quality = tetopt.quality(mesh.points, mesh.cells, mesh.midpoints)
+    assert quality.volume == pytest.approx(mesh.cell_volumes.sum())
+    assert quality.smallest_volume == mesh.cell_volumes.min()
+    assert quality._replace(volume=0.0, smallest_volume=0.0) == tetopt.quality(mesh.points, mesh.cells)._replace(
+        volume=0.0, smallest_volume=0.0
+    )
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_parts_of_curved_cells(n):
+    """They fill a mesh again, each in its cell, on all nodes of order 2; of straight cells they are equal."""
+    mesh = with_bent_edges(ball_mesh(n), 0.05)
+    pieces, n_pieces = mesh.straight_pieces()
+    assert (n_pieces, len(pieces.cells)) == (2**n, 2**n * len(mesh.cells))
+    assert tetopt.check_mesh(pieces) == []
+    nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
+    np.testing.assert_array_equal(pieces.points, nodes)
+    assert all(
+        set(own) <= set(whole) for own, whole in zip(pieces.cells, np.repeat(cells, n_pieces, axis=0), strict=True)
+    )
+    straight = tetopt.Mesh(mesh.points, mesh.cells)
+    assert straight.straight_pieces() == (straight, 1)
+    middles = mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)
+    equal = tetopt.Mesh(mesh.points, mesh.cells, middles).straight_pieces()[0].cell_volumes
+    np.testing.assert_allclose(equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9)
+
+
+def test_parts_of_a_folded_cell_are_straight():
+    """Its edges, and no others, so that cells beside it still meet it."""
+    mesh = with_bent_edges(ball_mesh(), 0.05)
+    midpoints, (edges, number) = mesh.midpoints.copy(), numbered_edges(mesh.cells)
+    cell, edge = 7, number[7, 0]
+    a, b = mesh.points[edges[edge]]
+    midpoints[edge] = a + 1.4 * (b - a)
+    pieces = tetopt.Mesh(mesh.points, mesh.cells, midpoints).straight_pieces()[0]
+    assert tetopt.check_mesh(pieces) == []
+    shown, straight = pieces.points[len(mesh.points) :], mesh.points[edges].mean(axis=1)
+    np.testing.assert_array_equal(shown[number[cell]], straight[number[cell]])
+    assert 0.5 < (shown == midpoints).all(axis=1).mean() < 1.0

@@ -31,6 +31,10 @@ def test_a_run_counts_and_writes_curved_edges(tmp_path):
     schemas.assert_described(written)
     assert written["curving"] == curving._asdict()
     assert curving.n_on_level > 50
+    volumes = np.bincount(result.optimized.labels, result.mesh.cell_volumes)
+    assert [row["mesh_volume"] for row in written["labels"]] == pytest.approx(volumes)
+    assert written["quality"]["volume"] == pytest.approx(labels.volume, rel=1e-12)
+    assert written["quality"]["smallest_volume"] == pytest.approx(result.mesh.cell_volumes.min())
     back = tetopt.load_mesh(output)
     np.testing.assert_array_equal(back.mesh.midpoints, result.mesh.midpoints)
     solved, again = (tetopt.solve(tetopt.build_model(mesh)) for mesh in (back, back._replace(mesh=result.mesh)))
@@ -66,7 +70,19 @@ def test_quality_of_curved_cells(is_folded, tmp_path, capfd):
     assert exit_code("quality", tmp_path / "a.vtu", "--check", "--json", numbers) == int(is_folded)
     shown = capfd.readouterr()
     assert "scaled Jacobian of curved cells, smallest" in shown.out
+    assert "Sizes are those of the curved cells; shapes, E_D and" in shown.out
+    assert f"{mesh.cell_volumes.sum():.2f}" in shown.out
     assert ("quadratic cells folded by their mid-edge nodes" in shown.err) == is_folded
     written = numbers_in(numbers)
     schemas.assert_described(written)
     assert (written["min_scaled_jacobian"] <= 0.0) == is_folded
+    assert written["quality"]["volume"] == pytest.approx(mesh.cell_volumes.sum())
+
+
+def test_a_surface_of_curved_cells_is_told_to_be_flat(tmp_path, capfd):
+    mesh = with_bent_edges(sample_model().mesh, 0.05)
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh, order=2)
+    assert exit_code("surface", tmp_path / "a.vtu", "--boundary", "-o", tmp_path / "a.stl") == 0
+    shown = capfd.readouterr()
+    assert "its cells are curved; the triangles are flat, between the corners of cells" in shown.err
+    assert f"{mesh.cell_volumes.sum():.6g}" in shown.out

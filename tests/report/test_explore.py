@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from browser import BLIND, FRAMES, copied, document
+from meshes import with_bent_edges
 
 import tetopt
 from tetopt.contents.labels import LABEL_PALETTE
@@ -35,6 +36,14 @@ def packed(page):
 
 def array(text, kind):
     return np.frombuffer(base64.b64decode(text), kind)
+
+
+def test_volumes_of_curved_cells_are_theirs(mesh):
+    """The page computes volumes of straight cells itself."""
+    curved = with_bent_edges(mesh, 0.05)
+    kept = array(packed(explorer_html(exhibit(curved, {})))["volumes"], "<f4")
+    np.testing.assert_allclose(kept, curved.cell_volumes, rtol=1e-6)
+    assert packed(explorer_html(exhibit(mesh, {})))["volumes"] is None
 
 
 def test_fields_are_labels_or_quantities(mesh, cell_data):

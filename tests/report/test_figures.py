@@ -10,9 +10,12 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 
+from tetopt.contents.content import content
 from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE
+from tetopt.contents.phantom import load_phantom
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.meshing import mesh_image
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -34,6 +37,7 @@ from tetopt.report.figures import (
     slice_figure,
 )
 from tetopt.report.scene import save_scenes
+from tetopt.report.thumbnail import save_thumbnail
 from tetopt.start.lattice import lattice_mesh
 
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
@@ -502,6 +506,30 @@ def test_a_mask_of_another_shape_is_refused():
     image = Image(np.zeros(SHAPE))
     with pytest.raises(InputError, match="mask: expected the image's shape"):
         boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice_mesh(image, blocks=(1, 1, 1)))
+
+
+def test_curved_cells_are_drawn_as_straight_parts(tmp_path):
+    """Their outline is nearer to the disc than that of the corners; titles say so, and no title of straight cells."""
+    labels = load_phantom("disc_2d").label_image()
+    result = mesh_image(content(labels, labels), 300, order=2, iterations=6)
+    mesh, view = result.mesh, SliceView(labels, None, None)
+    polygons, cells = view.section(mesh)
+    pieces, n_pieces = mesh.straight_pieces()
+    np.testing.assert_array_equal(cells, np.repeat(np.arange(len(mesh.cells)), n_pieces))
+    np.testing.assert_allclose(areas(polygons), pieces.cell_volumes)
+    assert len(view.interfaces(mesh, result.labels)[0]) == 2 * len(
+        view.interfaces(Mesh(mesh.points, mesh.cells), result.labels)[0]
+    )
+    words = "\ncurved cells drawn as 4 straight ones"
+    for each, is_curved in ((mesh, True), (Mesh(mesh.points, mesh.cells), False)):
+        figure = label_figure(labels, each, result.labels)
+        assert figure.axes[1].get_title().endswith(words) == is_curved
+        assert slice_figure(labels, [("a", each)]).axes[0].get_title() == f"a{words * is_curved}"
+        mask = Image(labels.data == 1, labels.affine)
+        (legend,) = boundary_figure(labels, mask, each).legends
+        assert legend.get_texts()[1].get_text().endswith(words) == is_curved
+        save_thumbnail(tmp_path / f"{is_curved}.png", labels, each, labels=labels, of_cell=result.labels)
+    assert (tmp_path / "True.png").read_bytes() != (tmp_path / "False.png").read_bytes()
 
 
 # --------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     image : Image
         The intensities h, with the dimension of the mesh.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved edges count as straight.
 
     Returns
     -------

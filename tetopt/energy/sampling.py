@@ -99,7 +99,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     image : Image
         The intensities h, 2-D or 3-D as the mesh is.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved edges count as straight.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     image : Image
         The intensities h, 2-D or 3-D as the mesh is.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved edges count as straight.
 
     Returns
     -------

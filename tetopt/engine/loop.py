@@ -196,7 +196,8 @@ class MeshingResult(NamedTuple):
             *notebook.mesh_rows(mesh.points, mesh.cells),
             *(("violates", f"{name}: {words}") for name, words in self.violated.items()),
         ]
-        return notebook.card_html("MeshingResult", rows, notebook.section_html(mesh.points, mesh.cells))
+        pieces = mesh.straight_pieces()[0]
+        return notebook.card_html("MeshingResult", rows, notebook.section_html(pieces.points, pieces.cells))
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:

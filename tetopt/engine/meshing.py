@@ -36,7 +36,7 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, meshing_bytes
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.requirements import requested, unexplained_by
+from tetopt.engine.requirements import checked_curved, requested, unexplained_by
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -279,7 +279,7 @@ class MeshSearch:
         result = requested(result, content, aim.target_error, is_filled)
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
-            result = result._replace(mesh=mesh, curving=curving)
+            result = checked_curved(result._replace(mesh=mesh, curving=curving), content)
         seconds = time.perf_counter() - self._begin
         return result._replace(seconds_start=seconds - self._seconds, seconds_run=self._seconds)
 

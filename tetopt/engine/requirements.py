@@ -7,7 +7,7 @@ the command exits with status 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache, partial
+from functools import cache
 from math import prod
 from typing import NamedTuple
 
@@ -26,11 +26,12 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
-from tetopt.geometry.simplex import dihedral_angles, volumes
+from tetopt.geometry.simplex import dihedral_angles
 from tetopt.geometry.topology import components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
+OF_VOXELS = ("mask", "components", "labels")  # requirements on the voxels in cells, which curved edges change
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
 COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
@@ -76,7 +77,12 @@ def checked(
         of memory, counts as violated, with the reason, and the mesh is kept.
     """
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
-    owner = cache(partial(cell_of_voxel, content.image, result.mesh))
+
+    @cache
+    def owner() -> NDArray[np.int64]:
+        pieces, n_pieces = result.mesh.straight_pieces()
+        return cell_of_voxel(content.image, pieces) // n_pieces
+
     if (region := content.region) is not None:
         of_domain = {
             "mask": lambda: _violated_mask(region, result, owner(), dice),
@@ -98,6 +104,14 @@ def checked(
         except Exception as error:
             violated[name] = f"{name} could not be checked: {type(error).__name__} {error}".rstrip()
     return result._replace(violated=violated)
+
+
+def checked_curved(result: MeshingResult, content: Content) -> MeshingResult:
+    """Check again, on the cells that order 2 has curved, which voxels and volumes they contain."""
+    if result.mesh.midpoints is None:
+        return result
+    violated = {name: words for name, words in result.violated.items() if name not in OF_VOXELS}
+    return result._replace(violated={**violated, **checked(result, content, 0.0, result.mesh).violated})
 
 
 def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[str, str]:
@@ -173,7 +187,7 @@ def _violated_mask(
 ) -> dict[str, str]:
     violated = {}
     is_covered, inside = owner >= 0, region.inside
-    if twice := result.history[-1].n_voxels - int(is_covered.sum()):
+    if result.mesh.midpoints is None and (twice := result.history[-1].n_voxels - int(is_covered.sum())):
         violated["overlap"] = (
             f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
         )
@@ -283,7 +297,7 @@ def _label_fits(
         rows = np.where(is_covered, rows, OUTSIDE_LABEL)
     painted = np.append(of_cell, outside)[owner]
     numbers, place = np.unique(of_cell, return_inverse=True)
-    sizes = np.bincount(place, volumes(mesh.points, mesh.cells)) / (content.image.voxel_volume * members.parts)
+    sizes = np.bincount(place, mesh.cell_volumes) / (content.image.voxel_volume * members.parts)
     n_in_cells, fits = dict(zip(numbers.tolist(), sizes.tolist(), strict=True)), []
     for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
         if box is not None:
@@ -307,4 +321,4 @@ def _own_voxels(content: Content) -> tuple[tuple[slice, ...], NDArray[np.float64
 
 
 def _volume(mesh: Mesh) -> float:
-    return float(volumes(mesh.points, mesh.cells).sum())
+    return float(mesh.cell_volumes.sum())

@@ -236,7 +236,7 @@ def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[
 
 def filled_fraction(mesh: Mesh, image: Image) -> float:
     """Ratio of the cells' volume to that of the image's box; 1 if they fill it without overlaps."""
-    return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
+    return float(mesh.cell_volumes.sum()) / image.volume
 
 
 def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:

@@ -21,6 +21,14 @@ from tetopt.geometry.simplex import determinants, outward_facet_nodes, volume_gr
 # Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and FEBio; the first
 # three are a triangle's, nodes 3 to 5.
 QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+# Local nodes of the straight cells into which a cell of order 2 is split, by dimension: one at each corner, the rest of
+# a tetrahedron around the line between nodes 6 and 8.
+STRAIGHT_PIECES = {
+    2: np.array([(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]),
+    3: np.array([
+        (0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3), (6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4),
+    ]),
+}  # fmt: skip
 CURVED_POINTS = {7: 2, 14: 3}  # number of points of `curved_rule`: its dimension
 ROOT_OF_15 = 15.0**0.5  # in the coordinates and weights of Radon's rule and Gauss's
 # Points of `curved_rule` by dimension, each for all distinct permutations of its coordinates, with their weights.
@@ -187,6 +195,32 @@ def jacobian_ratios(
     gradients = volume_gradients(nodes, corners) / volumes(nodes, corners)[:, None, None]
     maps = (mapped_slopes(nodes[cells], slopes @ gradients) for slopes in shape_slopes(places, 2))
     return np.stack([determinants(each) for each in maps], axis=1)
+
+
+def curved_volumes(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Volumes (areas in 2-D) of quadratic cells (M, 6 or 10), (M,), mm^n: exact, as the determinant is of degree n."""
+    places, weights = curved_rule(nodes.shape[1])
+    mean = (jacobian_ratios(nodes, cells, places) * weights).sum(axis=1)
+    return volumes(nodes, cells[:, : nodes.shape[1] + 1]) * mean
+
+
+def straight_pieces(
+    points: NDArray[np.float64], cells: NDArray[np.int64], midpoints: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Split cells (M, n+1) with curved edges at their midpoints: nodes of order 2, and 4 M or 8 M straight cells.
+
+    Their facets lie nearer to curved ones than a straight cell's by a factor of four. The pieces of a cell follow each
+    other. Where one would be flat or inverted, as in a folded cell, the edges of the cell become straight.
+    """
+    nodes, whole = quadratic(points, cells, midpoints)
+    straight, n = quadratic(points, cells)[0], points.shape[1]
+    while True:
+        pieces = whole[:, STRAIGHT_PIECES[n]]
+        is_flat = volumes(nodes, pieces.reshape(-1, n + 1)).reshape(len(cells), -1).min(axis=1) <= 0.0
+        bent = whole[is_flat, n + 1 :]
+        if (nodes[bent] == straight[bent]).all():
+            return nodes, pieces.reshape(-1, n + 1)
+        nodes[bent] = straight[bent]
 
 
 def mapped_slopes(nodes: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:

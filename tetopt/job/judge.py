@@ -129,7 +129,8 @@ def judge(
     if label_names is not None and labels is None and part.mask_label is None:
         raise InputError("`label_names`: needs `labels` or `mask_label`")
     loaded = read_mesh(mesh)
-    shape, size = quality(loaded.mesh.points, loaded.mesh.cells), size_summary(loaded.mesh, loaded.order)
+    shape = quality(loaded.mesh.points, loaded.mesh.cells, loaded.mesh.midpoints)
+    size = size_summary(loaded.mesh, loaded.order)
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
     if loaded.mesh.midpoints is not None:
         numbers["min_scaled_jacobian"] = float(scaled_jacobians(loaded.mesh).min())

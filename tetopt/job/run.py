@@ -166,7 +166,9 @@ def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
 
 def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
     meshes = {"quality_initial": outcome.initial, "quality": outcome.result.mesh}
-    shapes = measured_each({name: partial(quality, each.points, each.cells) for name, each in meshes.items()}, failed)
+    shapes = measured_each(
+        {name: partial(quality, each.points, each.cells, each.midpoints) for name, each in meshes.items()}, failed
+    )
     return shapes.get("quality_initial"), shapes.get("quality")
 
 

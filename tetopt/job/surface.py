@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
-from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, checked_surface, save_surface
@@ -72,6 +71,8 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
     names = label_table(part.label_names, loaded).names
     write = _write_interfaces if part.interfaces or part.interface is not None else _write_closed
     written = write(loaded, mesh, output, part, names)
+    if loaded.mesh.midpoints is not None:
+        note(f"{mesh}: its cells are curved; the triangles are flat, between the corners of cells")
     return written._replace(numbers={"mesh": mesh.name, "surface": output.name} | written.numbers)
 
 
@@ -105,7 +106,7 @@ def _write_closed(
         ("triangles", str(len(surface.triangles))),
         ("closed surfaces", str(written.n_pieces)),
         ("volume, mm3", f"{written.volume:.6g}"),
-        ("volume of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}"),
+        ("volume of the cells, mm3", f"{loaded.mesh.cell_volumes[chosen].sum():.6g}"),
         ("area, mm2", f"{written.area:.6g}"),
     ]
     if surface.n_parted:

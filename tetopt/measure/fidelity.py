@@ -231,7 +231,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved edges count as straight.
 
     Returns
     -------
@@ -270,7 +270,7 @@ def label_fidelity(
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes exact.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell; `cell_labels` by default.
     mask : Image, optional
@@ -298,9 +298,9 @@ def label_fidelity(
     label 0: Dice 1.00, off by 0.5 mm
     label 1: Dice 1.00, off by 0.5 mm
     """
-    labels = checked_labels("labels", labels)
-    owner = cell_of_voxel(labels, mesh)
-    label_of_cell = _majority(labels, mesh, owner) if of_cell is None else checked_cell_labels(of_cell, mesh)
+    labels, (pieces, n_pieces) = checked_labels("labels", labels), mesh.straight_pieces()
+    owner = cell_of_voxel(labels, pieces) // n_pieces
+    label_of_cell = cell_labels(labels, mesh) if of_cell is None else checked_cell_labels(of_cell, mesh)
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
     painted, is_covered = _painted(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
@@ -314,14 +314,14 @@ def label_fidelity(
 
     n_true, n_cells = counts(true[true >= 0]), counts(label_of_cell)
     n_covered = counts(true[is_covered & (true >= 0)])
-    mesh_volume = counts(label_of_cell, volumes(mesh.points, mesh.cells))
+    of_piece, mesh_volume = np.repeat(label_of_cell, n_pieces), counts(label_of_cell, mesh.cell_volumes)
     n_empty = counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
-    overlap, beyond = _overlaps(Image(true, labels.affine), mesh, label_of_cell, len(n_true))
+    overlap, size, beyond = _overlaps(Image(true, labels.affine), pieces, of_piece, len(n_true))
     has_outside = (np.arange(len(n_true)) == outside).astype(float)
     boxes = scipy.ndimage.find_objects(true + 1)
-    shared = facets(mesh.cells)
-    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell, shared, outside)
-    one_layer = one_layer_fractions(mesh, label_of_cell, shared)
+    shared = facets(pieces.cells)
+    nodes, sides = _labels_beside_facets(labels, pieces, of_piece, shared, outside)
+    one_layer = one_layer_fractions(mesh, label_of_cell, shared if n_pieces == 1 else facets(mesh.cells))
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
     for row in np.flatnonzero(n_true):
@@ -329,7 +329,7 @@ def label_fidelity(
         n_components, lost = voxel_components(true[box] == row, is_met[box], labels.affine, box)
         is_side = (sides == row).sum(axis=1) == 1
         distances = np.concatenate(
-            _distances(FacetSurface(mesh.points, nodes[is_side]), half_level_surface(part == row, affine), face)
+            _distances(FacetSurface(pieces.points, nodes[is_side]), half_level_surface(part == row, affine), face)
         )
         rows.append(
             LabelFidelity(
@@ -343,7 +343,7 @@ def label_fidelity(
                 _dice(
                     overlap[row] + has_outside[row] * beyond[0],
                     n_true[row] * labels.voxel_volume,
-                    mesh_volume[row] + has_outside[row] * beyond[1],
+                    size[row] + has_outside[row] * beyond[1],
                 ),
                 *_mean_and_p95(distances),
                 n_components,
@@ -361,8 +361,8 @@ def label_fidelity(
 
 def _overlaps(
     labels: Image, mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
-) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Volume of each label's voxels in its cells and, for label 0, outside the mesh; and of all labels there.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
 
     Estimated from `POINTS_PER_CELL` points that fill each cell evenly.
     """
@@ -374,10 +374,11 @@ def _overlaps(
         labels_there = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
         own += labels_there == label_of_cell
         none += labels_there == 0
-    overlap = np.bincount(label_of_cell, own * size / POINTS_PER_CELL, n_labels)[:n_labels].astype(np.float64)
+    overlap = np.bincount(label_of_cell, own * size / POINTS_PER_CELL, n_labels).astype(np.float64)
     rest = max(labels.volume - float(size.sum()), 0.0)
     background = float((labels.data == 0).sum()) * labels.voxel_volume - float((none * size).sum() / POINTS_PER_CELL)
-    return overlap, (min(max(background, 0.0), rest), rest)
+    filled = np.bincount(label_of_cell, size, n_labels).astype(np.float64)
+    return overlap, filled, (min(max(background, 0.0), rest), rest)
 
 
 def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
@@ -388,7 +389,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     mask : Image
         From 0, outside, to 1, inside; fractions are partial volumes.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes exact.
 
     Returns
     -------
@@ -413,22 +414,23 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     low, high = mask.range
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
-    is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_FRACTION
+    pieces = mesh.straight_pieces()[0]
+    is_filled, is_inside = cell_of_voxel(mask, pieces) >= 0, mask.data >= INSIDE_FRACTION
     n_components, lost = voxel_components(is_inside, is_filled, mask.affine)
     n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
-    outer, is_on_box = facets_on_box(mesh, mask)
-    ours = FacetSurface(mask.to_index(mesh.points), outer[~is_on_box])
+    outer, is_on_box = facets_on_box(pieces, mask)
+    ours = FacetSurface(mask.to_index(pieces.points), outer[~is_on_box])
     theirs = half_level_surface(mask.data, np.eye(mask.ndim + 1))
     there, back = _distances(ours, theirs, 1.0)
     there_mm, back_mm = _distances(
-        FacetSurface(mesh.points, ours.facets),
+        FacetSurface(pieces.points, ours.facets),
         FacetSurface(mask.to_world(theirs.points), theirs.facets),
         _face(mask.voxel_volume, mask.ndim),
     )
     return MaskFidelity(
         n_inside,
         n_inside * mask.voxel_volume,
-        float(volumes(mesh.points, mesh.cells).sum()),
+        float(mesh.cell_volumes.sum()),
         _dice(int((is_inside & is_filled).sum()), n_inside, n_filled),
         *_mean_and_p95(there),
         *_mean_and_p95(back),
@@ -589,7 +591,7 @@ def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) 
     near, far = np.where(shared.cells >= 0, of_cell[shared.cells], -1).T
     is_surface = near != far
     near, far, nodes = near[is_surface], far[is_surface], shared.nodes[is_surface]
-    size, fractions = volumes(mesh.points, mesh.cells), {}
+    size, fractions = mesh.cell_volumes, {}
     for label in np.unique(of_cell).tolist():
         is_on, is_own = np.zeros(len(mesh.points), dtype=bool), of_cell == label
         is_on[nodes[(near == label) | (far == label)]] = True
@@ -663,7 +665,7 @@ def _n_components(cells: NDArray[np.int64]) -> int:
 
 
 class ImageFit(NamedTuple):
-    """Fit of the cells of a mesh to an image."""
+    """Fit of the cells of a mesh to an image; curved edges count as straight."""
 
     E_D: float  # intensity^2 mm^n
     E_D_fraction_of_variance: float | None  # over the voxels that the mesh covers; None if they are all equal

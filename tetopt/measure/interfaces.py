@@ -105,7 +105,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        A conforming mesh.
+        A conforming mesh; areas and folds of curved cells are those of their `Mesh.straight_pieces`.
     of_cell : (M,) array of whole numbers
         Label of each cell, such as from `tetopt.measure.fidelity.cell_labels`.
     mask : Image, optional
@@ -145,7 +145,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
         """Counts by label, without the outside."""
         return np.bincount(which[which >= 0], None if weights is None else weights[which >= 0], n_labels)
 
-    edges, nodes, turns = ridges.n_facets > 2, fans.n_fans > 1, _turns(mesh.points, surfaces, ridges)
+    edges, nodes = ridges.n_facets > 2, fans.n_fans > 1
     of_label = {
         "n_facets": counts(surfaces.label),
         "nonmanifold_edges": counts(ridges.label[edges]),
@@ -155,7 +155,13 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
         "mesh_euler": _cell_eulers(shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)),
         "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels, _outer_spaces(mesh.points, surfaces)),
     }
-    area = counts(surfaces.label, surface_areas(FacetSurface(mesh.points, surfaces.nodes)))
+    pieces, n_pieces = mesh.straight_pieces()
+    if n_pieces > 1:  # topology is that of the cells
+        surfaces = label_surfaces(facets(pieces.cells), np.repeat(of_cell, n_pieces))
+        ridges = surface_ridges(surfaces)
+    turns = _turns(pieces.points, surfaces, ridges)
+    turns[ridges.nodes.min(axis=1) >= len(mesh.points)] = np.nan  # within a curved facet
+    area = counts(surfaces.label, surface_areas(FacetSurface(pieces.points, surfaces.nodes)))
     n_folded, n_paired = counts(ridges.label[turns > FOLD_DEGREES]), counts(ridges.label[np.isfinite(turns)])
     rows = []
     for row in present.tolist():

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.geometry.quadratic import curved_volumes, quadratic
 from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
 from tetopt.interop import notebook
 
@@ -187,7 +188,7 @@ def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:
     return rho(points, cells), volumes(points, cells), *extremes
 
 
-def quality(points: Points, cells: Cells) -> Quality:
+def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Quality:
     """Measure the shape of a mesh's cells.
 
     For rho and the four errors see Section 2.1 of the paper (`tetopt.measure.quality.quality_errors`), for the kinds of
@@ -199,6 +200,8 @@ def quality(points: Points, cells: Cells) -> Quality:
         Node positions, mm, n = 2 or 3.
     cells : (M, n+1) array of int64
         Node indices of each cell.
+    midpoints : (E, n) array of float64, optional
+        Those of the mesh, if its edges are curved. Volumes are of these cells; all else is of the corners.
 
     Returns
     -------
@@ -226,6 +229,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     # Block by block, as the temporaries take 600 bytes per cell.
     blocks = [_of_cells(points, cells[at : at + BLOCK_CELLS]) for at in range(0, len(cells), BLOCK_CELLS)]
     shape, v, smallest, largest, shortest, longest = (np.concatenate(each) for each in zip(*blocks, strict=True))
+    v = v if midpoints is None else curved_volumes(*quadratic(points, np.asarray(cells, dtype=np.int64), midpoints))
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
     kinds = _kinds_of(points, cells, shape)
     return Quality(

@@ -12,7 +12,6 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.requirements import MASK_DICE, checked, requested, violated_box
 from tetopt.errors import warn
-from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -72,8 +71,8 @@ def warn_of_other_mask(mesh: Mesh, mask: Image | None) -> None:
     if mask is None:
         return
     inside = mask.data >= INSIDE_FRACTION
-    n_both = int((inside & (cell_of_voxel(mask, mesh) >= 0)).sum())
-    n_covered = float(volumes(mesh.points, mesh.cells).sum()) / mask.voxel_volume
+    n_both = int((inside & (cell_of_voxel(mask, mesh.straight_pieces()[0]) >= 0)).sum())
+    n_covered = float(mesh.cell_volumes.sum()) / mask.voxel_volume
     dice = 2.0 * n_both / (n_covered + int(inside.sum()))
     if dice < MASK_DICE:
         warn(

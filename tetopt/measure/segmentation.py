@@ -27,7 +27,7 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     image : Image or Content
         The intensities h. For a mesh of a content, pass the content: voxels outside its mask do not count.
     mesh : Mesh
-        Mesh of the image's box or a part of it.
+        Mesh of the image's box or a part of it; curved edges count as straight.
     classes : int
         Number of classes, 2 or more.
 

@@ -72,7 +72,7 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`.
     of_cell : (M,) array of whole numbers
         Label of each cell, such as from `tetopt.cell_labels`.
     mask : Image, optional
@@ -99,10 +99,11 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     """
     labels = checked_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
-    shared = facets(mesh.cells)
-    sides = of_cell[shared.cells]
+    pieces, n_pieces = mesh.straight_pieces()
+    shared = facets(pieces.cells)
+    sides = np.repeat(of_cell, n_pieces)[shared.cells]
     is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
-    area = surface_areas(FacetSurface(mesh.points, shared.nodes[is_contact]))
+    area = surface_areas(FacetSurface(pieces.points, shared.nodes[is_contact]))
     in_mesh = _by_pair(sides[is_contact, 0], sides[is_contact, 1], area)
     in_voxels = _voxel_contacts(labels, mask)
     return [
@@ -154,7 +155,7 @@ def label_thickness(
         A content with smooth labels: their levels give the smooth surfaces, and both are measured at its voxels (finer
         ones if slices are thick).
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`.
     of_cell : (M,) array of whole numbers
         Label of each cell.
 
@@ -203,11 +204,12 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     thick = local_thickness(members, spacing, most, inside)
     of_voxels = _percentiles(thick, rows, members.labels, most)
     values, row = np.unique(of_cell, return_inverse=True)
-    owner = cell_of_voxel(grid, mesh)
+    pieces, n_pieces = mesh.straight_pieces()
+    owner = cell_of_voxel(grid, pieces) // n_pieces
     rows = np.where(owner >= 0, row[owner], BEYOND_REGION)
-    shared = facets(mesh.cells)
-    is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
-    corners = (grid.to_index(mesh.points) * spacing)[shared.nodes[is_between]]
+    shared = facets(pieces.cells)
+    is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[:, 0].astype(bool)
+    corners = (grid.to_index(pieces.points) * spacing)[shared.nodes[is_between]]
     of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values, most)
     is_right = (owner >= 0) & (members.labels[members.partition] == of_cell[owner])
     is_right &= True if inside is None else inside

@@ -11,7 +11,7 @@ from tetopt.contents.content import Content, own_image
 from tetopt.energy.sampling import cell_moments_and_ranges
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
-from tetopt.geometry.simplex import dihedral_angles, rho, volumes
+from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.image import Image
 from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.mesh import Mesh
@@ -31,7 +31,7 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
     Parameters
     ----------
     mesh : Mesh
-        Points in world coordinates, mm.
+        Points in world coordinates, mm. Of curved cells only the volume is theirs, all else is of straight ones.
     image : Image or Content, optional
         Without it, the fields of the image are omitted. For a mesh of a content, pass the content: voxels outside its
         mask take the value of the nearest voxel inside.
@@ -68,7 +68,7 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
         moments, (low, high) = cell_moments_and_ranges(own_image(image), mesh)
         fields |= {"mean": moments.mean, "variance": moments.variance, "n_voxels": moments.n_voxels}
         fields |= {"min": low, "max": high}
-    fields["volume"] = volumes(mesh.points, mesh.cells)
+    fields["volume"] = mesh.cell_volumes
     fields["rho"] = rho(mesh.points, mesh.cells)
     fields["min_dihedral"] = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     return fields

@@ -464,6 +464,7 @@ function explore(gl, data, notes) {
     const nodes = data.nNodes > corners ? `${whole(corners)} corner nodes (of ${whole(data.nNodes)})`
       : `${whole(corners)} nodes`;
     const words = [`World coordinates: RAS, mm. Mesh: ${nodes}, ${whole(mesh.count)} cells, ${number(volume, 7)} mm³.`];
+    if (data.volumes) words.push("Its cells are curved: volumes are theirs, but edges are drawn straight.");
     if (image) {
       const coarser = image.shape.join() === image.original.join() ? "" : `, averaged to ${image.shape.join(" × ")}`;
       words.push(`Image: ${image.original.join(" × ")} voxels${coarser}; black is ${number(image.limits[0])},

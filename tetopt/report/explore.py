@@ -52,6 +52,7 @@ def explorer_html(shown: Exhibit) -> str:
         "centre": centre.tolist(),
         "points": packed(mesh.points - centre, "<f4"),
         "cells": packed(mesh.cells, "<u4"),
+        "volumes": None if mesh.midpoints is None else packed(mesh.cell_volumes, "<f4"),  # of curved cells
         "labelField": LABEL_FIELD,
         "fields": [_packed_field(field) for field in fields],
         "skipped": skipped,

@@ -82,6 +82,7 @@ function unpackedMesh(data) {
   return {
     rest, points: rest, cells, count: cells.length / 4, neighbours: neighbours(cells, rest.length / 3),
     ...boxOf(rest), ...centroidsAndVolumes(rest, cells),
+    ...(data.volumes ? { volumes: new Float32Array(bytes(data.volumes)) } : {}),
   };
 }
 

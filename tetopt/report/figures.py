@@ -90,13 +90,18 @@ def slice_figure(
         over, flat = grid[:, column]
         view.show_pixels(over, limits)
         draw_edges(over, polygons)
-        over.set_title(title, fontsize=11)
+        over.set_title(title + _curved_words(mesh), fontsize=11)
         means = cell_moments(image if means_of is None else means_of, mesh).mean
         fill_cells(flat, polygons, means[cells], "gray", limits)
         flat.set_title("mean of the image in each cell", fontsize=10)
         for axes in (over, flat):
             view.frame(axes)
     return figure
+
+
+def _curved_words(mesh: Mesh) -> str:
+    """Return a line for the title of a slice through curved cells."""
+    return "" if mesh.midpoints is None else f"\ncurved cells drawn as {mesh.straight_pieces()[1]} straight ones"
 
 
 def _slice_through(mesh: Mesh, image: Image, axis: int | None) -> int | None:
@@ -204,7 +209,7 @@ def label_figure(
         for axes in (left, right):
             view.frame(axes)
     grid[0, 0].set_title("labels of the voxels", fontsize=11)
-    grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes", fontsize=11)
+    grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes{_curved_words(mesh)}", fontsize=11)
     if image is not None:
         _draw_interfaces(list(grid[:, 2]), image, mesh, of_cell, colours)
         grid[0, 2].set_title("interfaces of the cells over the image", fontsize=11)
@@ -301,7 +306,7 @@ def boundary_figure(
     whole.add_patch(Rectangle((low[0], low[1]), *(high - low), fill=False, edgecolor="white", linewidth=1.2))
     detail.set_xlim(low[0], high[0])
     detail.set_ylim(low[1], high[1])
-    lines = ((MASK_LINE, f"outline of the {word}"), (MESH_LINE, "boundary of the mesh"))
+    lines = ((MASK_LINE, f"outline of the {word}"), (MESH_LINE, f"boundary of the mesh{_curved_words(mesh)}"))
     handles = [Line2D([], [], color=colour, linewidth=2.0, label=label) for colour, label in lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=10, frameon=False)
     return figure
@@ -358,24 +363,28 @@ class SliceView:
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their cells (K,)."""
-        index = self.image.to_index(mesh.points)
+        pieces, n_pieces = mesh.straight_pieces()
+        index = self.image.to_index(pieces.points)
         if self.across is None:
-            corners, cells = index[mesh.cells], np.arange(len(mesh.cells))
+            corners, cells = index[pieces.cells], np.arange(len(pieces.cells))
         else:
-            corners, cells = plane_cut(index, mesh.cells, index[:, self.across] - self.index)
-        return self._flat(corners), cells
+            corners, cells = plane_cut(index, pieces.cells, index[:, self.across] - self.index)
+        return self._flat(corners), cells // n_pieces
 
     def boundary(self, mesh: Mesh) -> NDArray[np.float64]:
         """Return the mesh's boundary in the slice, off the image's box, as segments (K, 2, 2), picture mm."""
-        index = self.image.to_index(mesh.points)
-        outer, is_on_box = facets_on_box(mesh, self.image)
+        pieces = mesh.straight_pieces()[0]
+        index = self.image.to_index(pieces.points)
+        outer, is_on_box = facets_on_box(pieces, self.image)
         if self.across is None:
             return self._flat(index[outer[~is_on_box]])
         return self._flat(triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
 
     def interfaces(self, mesh: Mesh, of_cell: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the interfaces between labels as segments (K, 2, 2), picture mm, and their two labels (K, 2)."""
-        index, shared = self.image.to_index(mesh.points), facets(mesh.cells)
+        pieces, n_pieces = mesh.straight_pieces()
+        index, shared = self.image.to_index(pieces.points), facets(pieces.cells)
+        of_cell = np.repeat(of_cell, n_pieces)
         is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
         nodes, sides = shared.nodes[is_between], of_cell[shared.cells[is_between]]
         if self.across is None:

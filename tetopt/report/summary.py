@@ -68,7 +68,8 @@ def run_summary(
     `shapes` are these qualities, if already measured; None for one that could not be measured.
     """
     if shapes is None:
-        shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
+        made = result.mesh
+        shapes = quality(initial.points, initial.cells), quality(made.points, made.cells, made.midpoints)
     first, last = result.history[0], result.history[-1]
     own = plain(image)
     is_varied = own.variance > 0.0

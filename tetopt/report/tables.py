@@ -26,12 +26,13 @@ LONGEST_NAME = 24  # of a label with its number, characters
 TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
 SOME_CONTACT = 0.25  # of the last contact shown: that of the largest ratio has as much, or is too small to matter
 THIN_ACROSS = 2.0  # cells: labels with fewer are thin
+STRAIGHT_WORDS = "Sizes are those of the curved cells; shapes, E_D and voxels are those of straight ones."
 LARGE_SIZE = 1e4  # mm3 or mm2: larger labels are shown without decimals
 
 
 def new_table(*columns: str | Text) -> Table:
     """Create a table with these headers: names left-aligned, numbers right-aligned."""
-    table = Table(box=None, header_style="bold", pad_edge=False)
+    table = Table(box=None, header_style="bold", pad_edge=False, caption_justify="left")
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right")
     return table

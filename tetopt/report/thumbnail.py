@@ -168,7 +168,7 @@ def _draw_mesh(
     panel: Axes, mesh: Mesh, place: NDArray[np.float64], axes: Sequence[int], colours: NDArray[np.float64] | None
 ) -> None:
     """Draw the cells that the plane through a place cuts, in their colours (M, 3) if any, and the mesh's boundary."""
-    flat = list(axes)
+    flat, (mesh, n_pieces) = list(axes), mesh.straight_pieces()
     if len(place) == 2:
         corners, cells = mesh.points[mesh.cells], np.arange(len(mesh.cells))
         shared = facets(mesh.cells)
@@ -182,8 +182,9 @@ def _draw_mesh(
         boundary, _ = triangle_cut(mesh.points, shared.nodes[shared.n_cells == 1], height)
     polygons = corners[..., flat]
     if colours is not None:
-        is_shown = np.isfinite(colours[cells, 0])
-        faces = np.column_stack([colours[cells[is_shown]], np.full(is_shown.sum(), LABEL_ALPHA)])
+        colours = colours[cells // n_pieces]
+        is_shown = np.isfinite(colours[:, 0])
+        faces = np.column_stack([colours[is_shown], np.full(is_shown.sum(), LABEL_ALPHA)])
         panel.add_collection(PolyCollection(list(polygons[is_shown]), facecolors=faces, edgecolors="none"))
     width = min(0.25, EDGE_POINTS / np.sqrt(max(len(polygons), 1)))  # points
     panel.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))

@@ -154,7 +154,7 @@ def measured(
         E_D_fraction=unexplained_of(*moments),
         n_missed_voxels=int((cell_of_voxel(image, mesh) < 0).sum()),
         n_empty_cells=int((moments.n_voxels == 0).sum()),
-        quality=quality(mesh.points, mesh.cells),
+        quality=quality(mesh.points, mesh.cells, mesh.midpoints),
         rho_histogram=records.Histogram(edges.tolist(), fraction.tolist()),
         dihedral_histogram=records.Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=label_fidelity(labels, mesh, majority),
