@@ -34,12 +34,14 @@ from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
-# of a label's volume that tension and mending must leave; with .5, fluid has .54 of its volume at Dice .57, not .80 at
-# .65 (MNI152, 5,000 nodes), and ribs of a CT have half of theirs
-LEAST_FRACTION = 0.9
-MOST_FRACTION = 1.2  # of a label's volume that mending may reach; without, a slab of a third of its cells gets 1.7
-# the same two at the end, while two labels have pinches: with the last pair alone, a ball of 46 cells loses a third
-LAST_FRACTIONS = (0.8, 1.35), (0.65, 1.5), (0.05, 3.0)
+# of a label's volume near its surface, the most that tension and mending may take, and that mending may add: with a
+# tenth and a fifth of the whole volume, Dice of white matter is .866, not .884 (MNI152, 5,000 nodes), and ribs of a CT
+# have .57 of their volume, not .68
+LARGEST_LOSS, LARGEST_GAIN = 0.1, 0.05
+FRAGMENT_FRACTION = 0.1  # of a label's volume: larger components of cells are not given away
+# of a label's volume, at least and at most, at the end, while two labels have pinches: with the last pair alone, a ball
+# of 46 cells loses a third
+LAST_FRACTIONS = (0.9, 1.2), (0.65, 1.5), (0.05, 3.0)
 UNFIT_FRACTION = 0.3  # of the volume of a label smaller than a cell: if its cells have no more, it is dropped
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
 COMPONENT_FRACTION = 0.5
@@ -133,23 +135,39 @@ def labelled(
     dual = _dual(points, cells, across, counts, contacts, weight)
     voxel = float(dual.volume.sum() / counts.sum())
     aim = np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64)
+    bounds = _bounds(dual, aim)
     if keeps_volumes:
-        _balance(dual, aim)
-    return _given(dual, aim, voxel, components)
+        _balance(dual, aim, bounds[0])
+    return _given(dual, aim, bounds, voxel, components)
 
 
-def _given(dual: Dual, aim: NDArray[np.float64], voxel: float, components: list[NDArray]) -> NDArray[np.int64]:
+def _bounds(dual: Dual, aim: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least and largest volumes of labels, (2, K) mm^n, that tension and mending must keep to.
+
+    The volume near a label's surface is that of its voxels but for those in cells that, like all cells beside them,
+    have most of it.
+    """
+    labels, cell = _majority(dual), np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
+    beside = np.where(dual.across >= 0, labels[dual.across], labels[:, None])
+    is_inner = (beside == labels[:, None]).all(axis=1)[cell] & (dual.row == labels[cell])
+    near = aim - np.bincount(dual.row[is_inner], dual.volume[is_inner], len(aim))
+    return np.stack([aim - LARGEST_LOSS * near, aim + LARGEST_GAIN * near])
+
+
+def _given(
+    dual: Dual, aim: NDArray[np.float64], bounds: NDArray[np.float64], voxel: float, components: list[NDArray]
+) -> NDArray[np.int64]:
     """Labels of cells, (M,), by the dual's bias."""
-    bounds, labels = np.multiply.outer((LEAST_FRACTION, MOST_FRACTION), aim), _majority(dual)
+    labels = _majority(dual)
     if dual.bias.any():
-        _keep_each(dual, labels)
+        _keep_each(dual, labels, aim)
     _settle(dual, labels, bounds[0], False)
     is_bridge = np.zeros(len(labels), dtype=bool)
     is_near, is_sound, is_due = np.ones((3, len(dual.scale)), dtype=bool)
     mended = np.full(len(labels), -1)
     for _ in range(MENDING_ROUNDS):
         before = labels.copy(), is_bridge.copy()
-        _without_fragments(dual, labels, is_bridge, voxel, components)
+        _without_fragments(dual, labels, is_bridge, aim, voxel, components)
         # Where nothing changed since mending failed, it fails again.
         is_near[dual.cells[labels != mended]] = True
         is_due[dual.cells[is_near[dual.cells].any(axis=1)]] = True
@@ -181,10 +199,10 @@ def unpinched(
     return labels
 
 
-def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
+def _keep_each(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
     """Give each label without cells the cell with most of it, unless that is too large or has far more of others."""
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
-    n_of, most = np.bincount(labels, minlength=len(dual.bias)), MOST_FILLED * np.bincount(dual.row, dual.volume)
+    n_of, most = np.bincount(labels, minlength=len(aim)), MOST_FILLED * aim
     for label in np.setdiff1d(dual.row, labels):
         place = np.flatnonzero(dual.row == label)
         place = place[np.argmax(dual.volume[place])]
@@ -195,15 +213,16 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64]) -> None:
             labels[best] = label
 
 
-def _balance(dual: Dual, aim: NDArray[np.float64]) -> None:
+def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
     """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that its cells lack.
 
-    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes is kept.
+    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes is kept. Tension
+    leaves each label its `least` volume.
     """
     longest, before, least_wrong, best = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim)), np.inf, dual.bias
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
-        _settle(dual, labels, LEAST_FRACTION * aim, False)
+        _settle(dual, labels, least, False)
         volume = np.bincount(labels, dual.size, len(aim))
         wrong = float(np.abs(volume - aim).sum())
         if wrong < least_wrong:
@@ -477,20 +496,20 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
 
 
 def _without_fragments(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], voxel: float, components: list[NDArray]
-) -> int:
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], aim: NDArray[np.float64], voxel: float,
+    components: list[NDArray],
+) -> int:  # fmt: skip
     """Bridge or relabel components of cells that no component of voxels justifies; return the number of changed cells.
 
     A label's components are ranked by the number of its voxels that they contain. The first stays, and each further one
     if the component of voxels of the same rank is not far smaller. The others are linked to a component of the same
     label or, if that costs more than `BRIDGE_RATIO` of the voxels lost otherwise, go to their neighbours cell by cell;
-    those with more of a label than it may lose (`LEAST_FRACTION`) stay apart.
+    those with more than `FRAGMENT_FRACTION` of a label stay apart.
     """
     number, of_component = components_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     is_own = dual.row == labels[cell]
     content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_component))
-    aim = np.bincount(dual.row, dual.volume, len(components))
     # Volume of the best other label in a cell: an upper limit of the loss if it goes.
     others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
     most = BRIDGE_RATIO * (content - np.bincount(number, others, len(of_component)))
@@ -518,7 +537,7 @@ def _without_fragments(
             is_loose[bridge[:count]] = is_loose[own] = False
             is_bridge[bridge[:count]] = True
             moved += count
-        elif content[component] > (1.0 - LEAST_FRACTION) * aim[of_component[component]]:
+        elif content[component] > FRAGMENT_FRACTION * aim[of_component[component]]:
             is_loose[own] = False
     return moved + _give_away(dual, labels, is_loose)
 
@@ -912,7 +931,8 @@ def _mend(
                 is_due[a] = True
                 continue
             can_grow = room[1] >= volume
-            is_due[a] = is_due[a] or not can_grow.all()
+            for cell in star[:count]:
+                is_due[a] = is_due[a] or not can_grow[labels[cell]]
             new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, is_sound, work)
             if new >= 0:
                 best, best_from, best_label = change, i, new
