@@ -126,7 +126,7 @@ def test_volumes_of_curved_cells_by_another_rule(n):
 
 
 @pytest.mark.parametrize("n", [2, 3])
-def test_parts_of_curved_cells(n):
+def test_pieces_of_curved_cells(n):
     """They fill a mesh again, each in its cell, on all nodes of order 2; of straight cells they are equal."""
     mesh = with_bent_edges(ball_mesh(n), 0.05)
     pieces, n_pieces = mesh.straight_pieces()
@@ -144,7 +144,7 @@ def test_parts_of_curved_cells(n):
     np.testing.assert_allclose(equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9)
 
 
-def test_parts_of_a_folded_cell_are_straight():
+def test_pieces_of_a_folded_cell_are_straight():
     """Its edges, and no others, so that cells beside it still meet it."""
     mesh = with_bent_edges(ball_mesh(), 0.05)
     midpoints, (edges, number) = mesh.midpoints.copy(), numbered_edges(mesh.cells)

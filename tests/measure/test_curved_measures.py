@@ -38,7 +38,7 @@ def test_volumes_are_exact(ball, measured):
     np.testing.assert_array_equal(tetopt.cell_fields(result.mesh)["volume"], result.mesh.cell_volumes)
 
 
-def test_overlaps_distances_and_areas_are_of_the_parts(ball, measured):
+def test_overlaps_distances_and_areas_are_of_the_pieces(ball, measured):
     """They are off by a quarter of what straight cells are, as are the pieces' facets."""
     labels, result = ball
     pieces, n_pieces = result.mesh.straight_pieces()
@@ -96,3 +96,17 @@ def test_requirements_are_on_curved_cells(ball, monkeypatch):
     assert sorted(checked_curved(curved, content).violated) == ["min_dihedral"]
     monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 1.01)
     assert "times that of voxels: 1 for label 1, 1 for label 0;" in checked_curved(curved, content).violated["labels"]
+
+
+def test_a_run_is_judged_by_its_curved_cells(monkeypatch):
+    """The same number as in the table of its labels, below which straight cells are by a tenth."""
+    labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+    content = tetopt.content(labels, labels)
+    monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 0.95)
+    result = tetopt.mesh_image(content, 600, order=2, iterations=4)
+    straight = tetopt.Mesh(result.mesh.points, result.mesh.cells)
+    assert "labels" in checked(result._replace(mesh=straight), content, 0.0, straight).violated
+    assert result.violated == {}
+    assert (
+        tetopt.label_fidelity(labels, result.mesh, result.labels)[1].mesh_volume > 0.95 * (labels.data == 1).sum() * 64
+    )

@@ -508,7 +508,7 @@ def test_a_mask_of_another_shape_is_refused():
         boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice_mesh(image, blocks=(1, 1, 1)))
 
 
-def test_curved_cells_are_drawn_as_straight_parts(tmp_path):
+def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
     """Their outline is nearer to the disc than that of the corners; titles say so, and no title of straight cells."""
     labels = load_phantom("disc_2d").label_image()
     result = mesh_image(content(labels, labels), 300, order=2, iterations=6)

@@ -77,12 +77,8 @@ def checked(
         of memory, counts as violated, with the reason, and the mesh is kept.
     """
     of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
-
-    @cache
-    def owner() -> NDArray[np.int64]:
-        pieces, n_pieces = result.mesh.straight_pieces()
-        return cell_of_voxel(content.image, pieces) // n_pieces
-
+    pieces, n_pieces = result.mesh.straight_pieces()
+    owner = cache(lambda: cell_of_voxel(content.image, pieces) // n_pieces)
     if (region := content.region) is not None:
         of_domain = {
             "mask": lambda: _violated_mask(region, result, owner(), dice),
