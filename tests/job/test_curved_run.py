@@ -9,6 +9,7 @@ from models import sample_image, sample_model
 
 import tetopt
 from tetopt.geometry.quadratic import numbered_edges
+from tetopt.geometry.topology import boundary_facets
 
 
 @pytest.mark.full
@@ -56,6 +57,22 @@ def test_a_start_with_curved_edges_loses_them_without_labels(tmp_path):
         result = tetopt.run(job, on=told.append)
         is_lost = any("curved edges become straight" in event.text for event in told)
         assert is_lost == (result.mesh.midpoints is None) == (iterations == 1)
+
+
+def test_volumes_of_converted_cells_are_those_of_the_written_order(tmp_path):
+    """Straight cells have the volume that their surface encloses, and keep it with order 2 again."""
+    mesh = with_bent_edges(sample_model().mesh, 0.05)
+    tetopt.save_mesh(tmp_path / "2.vtu", mesh, {"volume": mesh.cell_volumes, "rho": mesh.cell_volumes}, order=2)
+    surface = mesh.points[boundary_facets(mesh.cells)]
+    for source, output, order in (("2", "1", 1), ("1", "again", 2)):
+        paths = (tmp_path / f"{name}.vtu" for name in (source, output))
+        assert exit_code("convert", *paths, "--order", order) == 0
+        back = tetopt.load_mesh(tmp_path / f"{output}.vtu")
+        assert (back.order, back.mesh.midpoints) == (order, None)
+        assert back.cell_data["volume"].sum() == pytest.approx(np.linalg.det(surface).sum() / 6.0)
+        np.testing.assert_array_equal(back.cell_data["volume"], back.mesh.cell_volumes)
+        np.testing.assert_array_equal(back.cell_data["rho"], mesh.cell_volumes)
+    assert np.abs(mesh.cell_volumes / back.cell_data["volume"] - 1.0).max() > 1e-3
 
 
 @pytest.mark.parametrize("is_folded", [False, True])

@@ -29,6 +29,7 @@ from tetopt.job.model import (
     without_stale_results,
 )
 from tetopt.job.options import LabelledPart, SolverOptions
+from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
 from tetopt.model.file import MATERIAL_FIELDS, MeshFile, without_results
 from tetopt.model.model import Model
@@ -73,6 +74,7 @@ def convert_file(
     check_unfolded(loaded.mesh, source=str(mesh))
     loaded = without_stale_results(loaded, solver) if results is None else _with_results(loaded, results)
     solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
+    loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if image is None and solver.average is not None:
         raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
@@ -102,6 +104,15 @@ def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool)
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
     names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
     return texts_of(loaded) | {name: text for name in names if (text := loaded.text(name)) is not None}
+
+
+def _with_straight_edges(loaded: MeshFile) -> MeshFile:
+    """Return the mesh without curved edges, and the volumes of its cells; its other fields are of straight cells."""
+    if loaded.mesh.midpoints is None:
+        return loaded
+    mesh = Mesh(loaded.mesh.points, loaded.mesh.cells)
+    volumes = {"volume": mesh.cell_volumes} if "volume" in loaded.cell_data else {}
+    return loaded._replace(mesh=mesh, cell_data=loaded.cell_data | volumes)
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
