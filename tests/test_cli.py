@@ -245,7 +245,7 @@ def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, input
     history, lines = numbers["history"], said.err.splitlines()
     words = "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
     first = f"{inputs / 'sphere.nii.gz'}: {words}"
-    assert re.fullmatch(rf"{re.escape(first)}; at most \d\.\d+ GB of memory", lines[0])
+    assert re.fullmatch(rf"{re.escape(first)}; about \d\.\d+ GB of memory", lines[0])
     progress = [line for line in lines[1:] if line.startswith("iteration")]
     assert len(progress) == 4
     for k, (line, row) in enumerate(zip(progress, history, strict=True)):

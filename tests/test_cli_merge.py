@@ -108,6 +108,26 @@ def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
     assert "has no label for" not in said
 
 
+def test_labels_beyond_the_image_are_told_unless_left_out_on_purpose(folder, capsys):
+    image = tetopt.load_image(folder / "a.nii.gz")
+    labels = np.pad(tetopt.load_image(folder / "l.nii.gz").data, ((0, 2), (0, 0), (0, 0)), constant_values=99)
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels, image.affine))
+    tetopt.save_image(folder / "whole.nii.gz", tetopt.Image(labels, image.affine))
+    said = f"l.nii.gz: labels without a voxel in the image: 99 ({2 * labels[0].size} voxels)"
+    crop = f":{len(labels) - 2},:,:"
+    for more, name, is_told in (
+        ([], "a.nii.gz", True), (["--merge", "white=99; rest=*"], "a.nii.gz", False),
+        (["--crop", crop], "whole.nii.gz", False),
+    ):  # fmt: skip
+        assert exit_code(*words(folder, *more, image=name)) == 0
+        assert (said in capsys.readouterr().err.replace("\n  ", " ")) == is_told
+    assert exit_code(*words(folder)) == 0
+    capsys.readouterr()
+    files = ["--image", folder / "a.nii.gz", "--labels", folder / "l.nii.gz"]
+    assert exit_code("quality", folder / "m.vtu", *files) == 0
+    assert said in capsys.readouterr().err.replace("\n  ", " ")
+
+
 def test_what_cannot_be_merged(folder, capsys):
     assert "--merge: needs --labels" in refused(
         capsys, "mesh", folder / "a.nii.gz", "-o", folder / "x.vtu", "--merge", "aseg"

@@ -241,7 +241,7 @@ def test_the_time_left_is_told_from_the_third_iteration_on():
 
 
 def test_the_log_tells_nodes_memory_and_time(tmp_path, capsys):
-    """The nodes of sizes and the bound of memory, as in run.json, come before the first iteration."""
+    """The nodes of sizes and the memory, as in run.json, come before the first iteration."""
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
     words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--edge-size", "9", "--iterations", "5")
     assert exit_code(*words) == 0
@@ -250,7 +250,7 @@ def test_the_log_tells_nodes_memory_and_time(tmp_path, capsys):
     numbers = numbers_in(tmp_path / "a.json")
     assert f"sizes require about {numbers['nodes_of_sizes']} nodes" in before
     bound = numbers["memory"]["predicted_bytes"]
-    stated = float(re.search(r"at most (\S+) GB of memory", before)[1])
+    stated = float(re.search(r"about (\S+) GB of memory", before)[1])
     assert stated == pytest.approx(bound / 1e9, rel=0.05)
     assert numbers["memory"]["peak_bytes"] < 1.2 * bound
     lines = re.split(r"iteration +\d+/5", after)

@@ -289,7 +289,7 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--dry-run") == 0
     words = capsys.readouterr().out
     assert re.search(r"sub-01: 0\.\d+ GB\n", words)
-    assert re.search(r"2 subjects, at most 0\.\d+ GB each; \d at a time", words)
+    assert re.search(r"2 subjects, up to about 0\.\d+ GB each; \d at a time", words)
     assert not (small / "out").exists()
 
 

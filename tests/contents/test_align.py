@@ -175,6 +175,25 @@ def test_two_dimensions():
     np.testing.assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
+def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):
+    """The largest first; neither 0 nor what the image's voxels keep in part, nor a label lost between larger ones."""
+    labels = np.zeros((20, 12))
+    labels[:12, :6], labels[10:, 9:] = 3.0, 50.0
+    labels[14:, :8] = np.arange(48).reshape(6, 8) // 8 + 20.0
+    labels[15, 1], labels[3, 9] = 3.0, 8.0
+    whole, image = tetopt.Image(labels), tetopt.Image(np.zeros((11, 12)))
+    tetopt.resample_labels(whole, image, "l")
+    tetopt.resample_labels(whole, tetopt.Image(np.zeros((20, 12))), "l")
+    mask = tetopt.Image(np.arange(20)[:, None] + np.zeros((20, 12)) < 15)
+    tetopt.content(whole, whole, mask)
+    tetopt.content(whole, whole, tetopt.Image(labels > 0.0))
+    sizes = ", ".join(f"{label} (8 voxels)" for label in (20, 22, 23, 24, 25))
+    assert [str(each.message) for each in recwarn] == [
+        f"l: labels without a voxel in the image: {sizes} and 1 more",
+        f"labels without a voxel in the mask: {sizes.removeprefix('20 (8 voxels), ')}, 21 (7 voxels)",
+    ]
+
+
 def test_a_label_that_falls_between_voxels_of_its_size_is_told():
     """A voxel in the middle of a cell of the grid turned by 45 degrees."""
     labels, affine = np.ones((5, 5)), np.eye(3)
@@ -359,6 +378,12 @@ def test_levels_that_leave_nothing():
     image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
     todo = "; choose a level between the background's and the tissue's values (the image ranges from 10 to 90)"
     assert message(foreground_mask, image, 5) == "`background` 5: every voxel is foreground" + todo
+    inside = tetopt.Image(image.data > 50.0, image.affine)
+    words = message(foreground_mask, image, 5, inside)
+    assert (
+        words
+        == f"`background` 5: every voxel is foreground{todo}; or give the labels' file as `mask`, with `mask_label`"
+    )
     assert message(foreground_mask, image, 90) == "`background` 90: no voxel is foreground" + todo
     # A level given is taken at its word, however little it leaves.
     data = np.zeros((40, 40))

@@ -237,7 +237,7 @@ def test_components_of_a_mask_without_a_cell():
     number, _ = scipy.ndimage.label(mask.data > 0.5)
     gone = number == next(k for k in (1, 2) if not ((number == k) & (tetopt.cell_of_voxel(mask, one) >= 0)).any())
     words = judged(one, target).violated["components"]
-    assert words.startswith(f"components of the mask without a cell: {gone.sum()} voxels at (")
+    assert words.startswith(f"components of the mask of 50 voxels or more without a cell: {gone.sum()} voxels at (")
     place = [float(each) for each in words.split("(")[1].split(")")[0].split(", ")]
     assert gone[tuple(np.rint(mask.to_index(place)).astype(int))]
     (row,) = tetopt.mask_fidelity(mask, one).lost_components

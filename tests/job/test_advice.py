@@ -12,6 +12,7 @@ from tetopt.engine.requirements import LABEL_REMEDY
 from tetopt.job.advice import agreed, beyond_requirements, of_empty, of_result, of_sizes, sentences, tell, unmet
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
+from tetopt.measure.interfaces import LabelInterface
 from tetopt.start.sizes import EdgeRatios, Sizes
 
 NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
@@ -90,7 +91,7 @@ def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
     told(*unmet({}, {"labels": [*rows, label_of(9, 0.0, True)]}))
     (line,) = (line for line in said().splitlines() if "ratio" in line)
     assert line.startswith("2 labels with more than 2 times the volume")
-    assert "(ratio in brackets): 5 (0.22), 2 (2.1); allow more nodes" in line
+    assert "(ratio in brackets): 5 (0.222), 2 (2.06); allow more nodes" in line
 
 
 def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
@@ -99,7 +100,7 @@ def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
     assert told(*unmet({}, {"labels": [label_of(k, volume, voxels=199) for k, volume in volumes]})) == {}
     assert "labels" not in said()
     names = {"label_names": {5: "wall"}, "labels": rows}
-    words = "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.59 for label 5 (wall), 1.5 for label 2"
+    words = "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.589 for label 5 (wall), 1.51 for label 2"
     assert told(*unmet({"labels": "by numbers"}, names)) == {"labels": f"{words}; {LABEL_REMEDY}"}
     # With a part of the label in the mesh, the volume is that of the part.
     half = [row._replace(covered_voxels=300, voxels=600, mesh_volume=0.5 * row.mesh_volume) for row in rows]
@@ -112,7 +113,9 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
     lost = tuple(LostComponent(n, (1.0, 2.5, 1234.56)) for n in (99, 60, 50, 50))
     rows = [label_of(3)._replace(lost_components=lost), label_of(4, is_lost=True)._replace(lost_components=lost[:2])]
     words = told(*unmet({}, {"labels": rows}))["labels"]
-    assert words.startswith("components of labels without a cell: 99 voxels of label 3 at (1, 2.5, 1235) mm, 99 voxels")
+    assert words.startswith(
+        "components of labels of 50 voxels or more without a cell: 99 voxels of label 3 at (1, 2.5,"
+    )
     assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {LABEL_REMEDY}")
     assert "no cell has label" not in said()  # named above
     small = [label_of(3)._replace(lost_components=tuple(each._replace(voxels=49) for each in lost))]
@@ -124,20 +127,66 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
 def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
     lost = tuple(LostComponent(n, (1.0, 2.5, 3.0)) for n in (40, 3))
     rows = [label_of(k, 9.0 * ratio) for k, ratio in enumerate((0.5, 0.86, 0.8, 1.14, 1.3, 0.1, 0.84, 1.2))]
-    assert beyond_requirements([rows[1], rows[3]], {}) == ""
-    assert beyond_requirements([], {}) == ""
+    assert beyond_requirements({"labels": [rows[1], rows[3]]}) == {}
+    assert beyond_requirements({}) == {}
     rows[1] = rows[1]._replace(lost_components=lost, components=9, mesh_components=7)
     rows[3] = rows[3]._replace(lost_components=lost[:1], components=2, mesh_components=2)
     rows[5] = rows[5]._replace(lost_components=lost[1:], components=1, mesh_components=1)  # its cell is elsewhere
     rows[7] = rows[7]._replace(mesh_components=3)
     rows[0] = rows[0]._replace(lost_components=lost, mesh_components=5)  # the space between tissues
-    assert beyond_requirements(rows, {5: "rib"}) == (
-        "labels: of 8, 6 with less than 0.85 or more than 1.15 times the volume of their voxels: "
+    assert beyond_requirements({"labels": rows, "label_names": {5: "rib"}}) == {
+        "not all labels fit": "labels: of 8, 6 with less than 0.85 or more than 1.15 times the volume of voxels: "
         "5 (rib) (0.1), 0 (0.5), 4 (1.3), 2 (0.8), 7 (1.2) and 1 more; "
         "3 with components without a cell: "
         "1 (2 of 9, voxels: 43), 3 (1 of 2, voxels: 40), 5 (rib) (1 of 1, voxels: 3); "
         "2 with more pieces of cells than of voxels: 7 (3), 3 (2)"
+    }
+
+
+def test_pieces_that_merge_and_cavities_that_open_are_counted():
+    """Components that are lost do not merge; of a label partly beyond the mesh, and of label 0, nothing is known."""
+    lost = tuple(LostComponent(n, (1.0, 2.5, 3.0)) for n in (40, 3))
+    counts = {
+        0: (9, 1, ()),
+        1: (3, 1, lost),
+        2: (3, 2, ()),
+        3: (9, 3, lost),
+        4: (9, 2, ()),
+        5: (9, 0, ()),
+        6: (1, 1, ()),
+    }
+    names = ("components", "mesh_components", "lost_components")
+    rows = [label_of(k, 9.0)._replace(**dict(zip(names, count, strict=True))) for k, count in counts.items()]
+    rows[4] = rows[4]._replace(voxels=2 * rows[4].covered_voxels, mesh_volume=4.5)
+    empty = dict.fromkeys(LabelInterface._fields, 0)
+    cavities = {0: (5, 1), 2: (1, 1), 3: (1, 2), 4: (1, 0), 5: (1, 0), 6: (3, 1)}
+    surfaces = [
+        LabelInterface(**empty | {"label": k, "cavities": n, "mesh_cavities": left})
+        for k, (n, left) in cavities.items()
+    ]
+    (line,) = beyond_requirements({"labels": rows, "interfaces": surfaces}).values()
+    assert line == (
+        "labels: of 7, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 (2 of 9, voxels: 43); "
+        "2 with fewer pieces of cells than of voxels: 3 (3 of 7), 2 (2 of 3); "
+        "1 with fewer cavities in cells than in voxels: 6 (1 of 3)"
     )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mesh_volume": 8.6}, ""),
+        ({"mesh_volume": 8.5}, "with less than 0.95 or more than 1.05 times the volume of voxels (0.944)"),
+        ({"mesh_volume": 9.5}, "with less than 0.95 or more than 1.05 times the volume of voxels (1.06)"),
+        (
+            {"components": 4, "lost_components": (LostComponent(7, (0.0, 0.0)), LostComponent(2, (1.0, 0.0)))},
+            "with components without a cell (2 of 4, voxels: 9); with fewer pieces of cells than of voxels (1 of 2)",
+        ),
+    ],
+)
+def test_what_requirements_allow_of_a_mask(change, words):
+    beyond = beyond_requirements({"mask": NEAR._replace(**change)}, "foreground")
+    assert beyond == ({"not all of the foreground fits": f"foreground: {words}"} if words else {})
 
 
 def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
@@ -174,7 +223,8 @@ def started_only():
     ("result", "mode", "nodes", "measured", "words"),
     [
         (ended(), "graded", 100, {}, ""),
-        (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations"),
+        (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations\n"),
+        (ended()._replace(ended="converged"), "graded", 120, {}, "100 nodes instead of 120\n"),
         (started_only(), "graded", 120, {}, "100 nodes instead of 120, as no iteration was made; allow some"),
         (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
         (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
@@ -194,6 +244,16 @@ def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
+
+
+def test_remedies_of_a_missed_number_of_nodes_are_those_that_apply(said):
+    for k_D, has_sizes, nodes, words in (
+        (0.0, True, 120, "use more iterations or a `k_D` above 0 or smaller sizes"),
+        (0.85, True, 80, "use more iterations or larger sizes"),
+        (0.0, False, 80, "use more iterations or a `k_D` above 0"),
+    ):
+        told(*of_result(ended(), "fast", "graded", 100, nodes, {}, k_D, has_sizes))
+        assert said() == f"100 nodes instead of {nodes}; {words}\n"
 
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):

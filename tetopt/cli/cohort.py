@@ -66,7 +66,7 @@ def _say_estimate(plan: CohortPlan) -> None:
     if not to_run:
         print_line("nothing to run")
         return
-    whole = f"{counted(len(to_run), 'subject')}, at most {memory_words(max(estimate.values(), default=0.0))} each"
+    whole = f"{counted(len(to_run), 'subject')}, up to about {memory_words(max(estimate.values(), default=0.0))} each"
     if cohort.scheduler is None:
         n_workers = share_for(len(to_run), estimate, cohort, plan.threads).workers
         whole += f"; {n_workers} at a time on this machine"

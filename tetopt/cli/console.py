@@ -210,15 +210,16 @@ def warnings_once() -> Callable[..., None]:
 
 
 def print_verdict(
-    violated: Iterable[str], words: str, measured: dict[str, Any], which: str = "all requirements"
+    violated: Iterable[str], words: str, measured: dict[str, Any], mask_word: str, which: str = "all requirements"
 ) -> None:
-    """Print the last lines of a command: what requirements allow of labels, whether they are met, the mesh in words."""
+    """Print a command's last lines: what requirements allow of mask and labels, whether they are met, the mesh."""
     from tetopt.job.advice import beyond_requirements  # imports numba
 
     names = ", ".join(violated)
-    if beyond := beyond_requirements(measured.get("labels", []), measured.get("label_names", {})):
-        print_line(beyond)
-    met = f"{which} are met" + (", but not all labels fit (above)" if beyond else "")
+    beyond = beyond_requirements(measured, mask_word)
+    for line in beyond.values():
+        print_line(line)
+    met = f"{which} are met" + (f", but {' and '.join(beyond)} (above)" if beyond else "")
     print_line(f"requirements not met: {names}; {words}" if names else f"{met}; {words}")
 
 

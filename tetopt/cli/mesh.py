@@ -30,7 +30,7 @@ def mesh_command(job: Job) -> int:
         display.close()  # the mesh's problems, before the last line
         size = f"{nodes_in_words(result.mesh, result.model.order)}, {len(result.mesh.cells)} cells"
         code = tell_end() if is_ended() else int(bool(result.violated))
-        print_verdict(result.violated, f"{job.output}: {size}", result.measured)
+        print_verdict(result.violated, f"{job.output}: {size}", result.measured, result.task.source.mask_word)
         return code
 
 

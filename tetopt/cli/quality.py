@@ -56,7 +56,7 @@ def quality_command(
     if check:
         whole = f"{nodes_in_words(judgement.loaded.mesh, judgement.loaded.order)}, {size['n_cells']} cells"
         which = "all requirements" if source is not None else "requirements that need no image"
-        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}", judgement.measured, which)
+        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}", judgement.measured, judgement.mask_word, which)
     return int(bool(wrong))
 
 

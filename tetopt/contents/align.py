@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import checked_labels
+from tetopt.contents.labels import checked_labels, warn_of_absent
 from tetopt.contents.memberships import finer_affine
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError, warn
@@ -107,7 +107,8 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Warns
     -----
     UserWarning
-        Values were rounded; labels lose a tenth of their volume or fall into pieces, as the image's voxels are larger.
+        Values were rounded; labels have no voxel in the image's box; labels lose a tenth of their volume or fall into
+        pieces, as the image's voxels are larger.
 
     Examples
     --------
@@ -125,6 +126,8 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         if (labels.data * in_box(image, labels)).any():
             raise InputError(f"{name}: the labels are lost between the centres of the image's larger voxels")
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
+    if not is_same_grid(labels, image):
+        warn_of_absent(f"{name}: ", labels, in_box(image, labels).astype(bool), "image")
     _warn_of_loss(name, "label", labels, Image(moved, image.affine))
     return Image(moved, image.affine)
 
@@ -327,10 +330,11 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
     if level is None:
         raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = image.range
+    instead = "; or give the labels' file as `mask`, with `mask_label`" if 0.0 < is_labelled.mean() < 1.0 else ""
     outcome = "every voxel is foreground" if fraction > 0.5 else "no voxel is foreground"
     raise InputError(
         f"`background` {limit:g}: {outcome}; choose a level between the background's and the tissue's values (the "
-        f"image ranges from {low:g} to {high:g})"
+        f"image ranges from {low:g} to {high:g}){instead}"
     )
 
 

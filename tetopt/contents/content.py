@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
-from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels
+from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels, warn_of_absent
 from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
 from tetopt.contents.noise import noise_level
 from tetopt.contents.statistics import Statistics
@@ -266,7 +266,9 @@ def content(
         beyond = continuation(mask, images[0].spacing)
         region = region_of(_part(mask, beyond.part))
         images = [continued(image, beyond) for image in images]
-        labels = None if labels is None else continued(labels, beyond)
+        if labels is not None:
+            warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
+            labels = continued(labels, beyond)
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
         raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")

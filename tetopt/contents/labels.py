@@ -34,6 +34,7 @@ LABEL_PALETTE = (
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
 LABEL_TINTS = (0.0, -0.4, 0.4)  # variants of the palette as it repeats: unchanged, mixed with black, mixed with white
+ABSENT_LISTED = 5  # labels without a voxel in an image or mask
 BACKGROUND_LABEL = 0  # the label outside all tissues
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
@@ -92,6 +93,19 @@ def _neighbours(data: NDArray, axis: int) -> tuple[NDArray, NDArray]:
     """Return the values of all pairs of voxels that are neighbours along an axis."""
     along = np.moveaxis(data, axis, 0)
     return along[:-1], along[1:]
+
+
+def warn_of_absent(name: str, labels: Image, is_kept: NDArray[np.bool_], where: str) -> None:
+    """Warn of labels above 0 none of whose voxels is kept, as it lies in the image or mask; the largest first."""
+    gone, counts = np.unique(labels.data[~is_kept & (labels.data > BACKGROUND_LABEL)], return_counts=True)
+    is_absent = ~np.isin(gone, np.unique(labels.data[is_kept])) if len(gone) else np.zeros(0, dtype=bool)
+    if is_absent.any():
+        rows = sorted(zip((-counts[is_absent]).tolist(), gone[is_absent].tolist(), strict=True))
+        words = ", ".join(
+            f"{label:.10g} ({-voxels} voxel{'s' * (voxels < -1)})" for voxels, label in rows[:ABSENT_LISTED]
+        )
+        more = f" and {len(rows) - ABSENT_LISTED} more" * (len(rows) > ABSENT_LISTED)
+        warn(f"{name}labels without a voxel in the {where}: {words}{more}")
 
 
 class LostComponent(NamedTuple):

@@ -35,6 +35,7 @@ OF_VOXELS = ("mask", "components", "labels")  # requirements on the voxels in ce
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
 COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
+LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
 COMPONENTS_LISTED = 5  # of those without a cell
@@ -205,7 +206,7 @@ def _violated_components(content: Content, region: Region, mesh: Mesh, owner: ND
         words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
         texts.append(f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells")
     large = [(each, "") for each in lost if each.voxels >= COMPONENT_VOXELS]
-    texts += [f"components of the mask without a cell: {_listed(large)}"] if large else []
+    texts += [f"components of the mask {LARGE_COMPONENTS} without a cell: {_listed(large)}"] if large else []
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
@@ -256,10 +257,10 @@ def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:
         )
     off = sorted((fit for fit in faulty if fit.is_off), key=lambda fit: -abs(np.log(fit.volume_ratio)))
     if off:
-        rows = ", ".join(f"{fit.volume_ratio:.2g} for label {words[fit.label]}" for fit in off)
+        rows = ", ".join(f"{fit.volume_ratio:.3g} for label {words[fit.label]}" for fit in off)
         texts.append(f"the volume of cells is not {LEAST_VOLUME:g} to {MOST_VOLUME:g} times that of voxels: {rows}")
     pieces = [(each, f" of label {words[fit.label]}") for fit in faulty for each in fit.pieces]
-    texts += [f"components of labels without a cell: {_listed(pieces)}"] if pieces else []
+    texts += [f"components of labels {LARGE_COMPONENTS} without a cell: {_listed(pieces)}"] if pieces else []
     return "; ".join(texts)
 
 

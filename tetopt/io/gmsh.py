@@ -65,6 +65,7 @@ TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh lists the midpoin
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
 NUMBER_COMMENT = "physical group {} is label {}"
+TEXTS = (MASK_TEXT, "violated")  # JSON in the comments
 MOST_MATERIAL_GROUPS = 1000  # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
 
 
@@ -72,7 +73,7 @@ class OwnComments(NamedTuple):
     """The comments of a file of tetopt's."""
 
     space: str
-    texts: dict[str, str]  # "units", "image", "image_sha256", "mask", if known
+    texts: dict[str, str]  # "units", "image", "image_sha256", "mask", "violated", if known
     constants: dict[str, tuple[float, float]]  # young and nu of each material defined by entities
     cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
     facets: dict[str, list[int]]  # entities of each facet set
@@ -99,8 +100,8 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
             for name in match[3].split():
                 entities[match[1]].setdefault(name, []).append(int(match[2]))
-        elif match := re.fullmatch(r"mask: (\{.*\})", line):
-            texts[MASK_TEXT] = match[1]
+        elif match := re.fullmatch(rf"({'|'.join(TEXTS)}): (\{{.*\}})", line):
+            texts[match[1]] = match[2]
         elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
             zero = int(match[1])
         elif match := re.fullmatch(NUMBER_COMMENT.format(r"(\d+)", r"(\d+)"), line):
@@ -135,7 +136,7 @@ def gmsh41(model: Model) -> bytes:
         grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
     parts = [_by_entity(part) for part in _parts(grouped)]
-    remarked = [*remarks(model if labels is not None else grouped), *_mask_comments(model)]
+    remarked = [*remarks(model if labels is not None else grouped), *_text_comments(model)]
     comments = [*remarked, *comments, *_entity_comments(model, parts)]
     counts = {part.dim: len(part.groups_of) for part in parts}
     n_elements = sum(len(part.numbers) for part in parts)
@@ -184,7 +185,7 @@ def gmsh22(model: Model) -> bytes:
         "2.2 0 8",
         [
             *remarks(model),
-            *_mask_comments(model),
+            *_text_comments(model),
             *without_data(without_labels(model)),
             *_entity_comments(model, parts),
         ],
@@ -198,10 +199,10 @@ def gmsh22(model: Model) -> bytes:
     )
 
 
-def _mask_comments(model: Model) -> list[str]:
-    """Return the comment on the mask that the mesh was built within, if any."""
-    text = model.about.get(MASK_TEXT)
-    return [] if text is None else [f"mask: {text if isinstance(text, str) else json.dumps(text)}"]
+def _text_comments(model: Model) -> list[str]:
+    """Return comments on the mask that the mesh was built within, and on requirements that its run violated, if any."""
+    texts = {name: model.about[name] for name in TEXTS if name in model.about}
+    return [f"{name}: {text if isinstance(text, str) else json.dumps(text)}" for name, text in texts.items()]
 
 
 def _n_materials(model: Model) -> int:

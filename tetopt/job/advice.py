@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,11 +17,13 @@ from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
+from tetopt.measure.interfaces import LabelInterface
 from tetopt.model.labels import label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
-NEAR_VOLUME = (0.85, 1.15)  # of a label's cells, over its voxels': other volumes are told beside the verdict
+# Of the cells, over the voxels': other volumes are told beside the verdict.
+NEAR_VOLUME, NEAR_MASK = (0.85, 1.15), (0.95, 1.05)
 VOLUME_RATIO = 2.0  # of a label's cells to its voxels, or the other way round: more is reported
 LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represent the label
 NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
@@ -144,7 +146,7 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     there = [row for row in others if row.covered_voxels and row.mesh_volume > 0.0]
     far = [row for row in there if max(ratios[row], 1.0 / ratios[row]) > VOLUME_RATIO]
     if far := sorted(far, key=lambda row: -max(ratios[row], 1.0 / ratios[row])):
-        worst = ", ".join(f"{words[row.label]} ({ratios[row]:.2g})" for row in far)
+        worst = ", ".join(f"{words[row.label]} ({ratios[row]:.3g})" for row in far)
         count = "1 label" if len(far) == 1 else f"{len(far)} labels"
         text = f"{count} with more than {VOLUME_RATIO:g} times the volume of the voxels, or less than half"
         yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
@@ -155,33 +157,50 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
         yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
 
 
-def beyond_requirements(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> str:
-    """Describe what requirements allow of labels: another volume, lost components, more pieces; empty if there is none.
+def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict[str, str]:
+    """Describe what requirements allow of the mask, with its name `word`, and of labels, by what it means; empty if
+    there is none.
 
-    Each is counted, and the worst are named, among all labels; of label 0, only the volume counts.
+    Labels are counted, and the worst named, among all labels; of label 0, only the volume counts.
     """
-    low, high = NEAR_VOLUME
-    faults: dict[str, list[tuple[float, str]]] = {
-        f"with less than {low:g} or more than {high:g} times the volume of their voxels": [],
-        "with components without a cell": [],
-        "with more pieces of cells than of voxels": [],
-    }
-    off, lost, split = faults.values()
+    beyond, of_labels = dict[str, str](), dict[str, list[tuple[float, str]]]()
+    if (mask := measured.get("mask")) is not None:
+        of_mask = [f"{what} ({words})" for what, _, words in _faults(mask, mask.mesh_volume / mask.volume, NEAR_MASK)]
+        beyond = {f"not all of the {word} fits": f"{word}: {'; '.join(of_mask)}"} if of_mask else {}
+    rows, names = measured.get("labels", []), measured.get("label_names", {})
+    surfaces = {each.label: each for each in measured.get("interfaces", [])}
     for row in rows:
-        ratio, voxels = row.volume_ratio, sum(each.voxels for each in row.lost_components)
-        n_lost, words = len(row.lost_components), label_words(row.label, names)
-        if row.covered_voxels and not low <= ratio <= high:
-            off.append((min(ratio, 1.0 / max(ratio, low)), f"{words} ({ratio:.2g})"))
-        if row.label != BACKGROUND_LABEL and n_lost:
-            lost.append((-voxels, f"{words} ({n_lost} of {row.components}, voxels: {voxels})"))
-        if row.label != BACKGROUND_LABEL and row.mesh_components > max(row.components - n_lost, 1):
-            split.append((-row.mesh_components, f"{words} ({row.mesh_components})"))
-    texts = [
-        f"{len(some)} {what}: {listed([each[1] for each in sorted(some, key=lambda each: each[0])], 5)}"
-        for what, some in faults.items()
-        if some
-    ]
-    return f"labels: of {len(rows)}, {'; '.join(texts)}" if texts else ""
+        ratio = row.volume_ratio if row.covered_voxels else 1.0
+        faults = _faults(row, ratio, NEAR_VOLUME, surfaces.get(row.label), row.covered_voxels == row.voxels)
+        for what, rank, words in faults:
+            if row.label != BACKGROUND_LABEL or "volume" in what:
+                of_labels.setdefault(what, []).append((rank, f"{label_words(row.label, names)} ({words})"))
+    texts = [f"{len(some)} {what}: {listed([each for _, each in sorted(some)], 5)}" for what, some in of_labels.items()]
+    return beyond | ({"not all labels fit": f"labels: of {len(rows)}, {'; '.join(texts)}"} if texts else {})
+
+
+def _faults(
+    row: LabelFidelity | MaskFidelity, ratio: float, near: tuple[float, float],
+    surface: LabelInterface | None = None, is_whole: bool = True,
+) -> Iterator[tuple[str, float, str]]:  # fmt: skip
+    """Yield kinds of faults of a label or mask, each with a rank, the least for the worst, and numbers.
+
+    `ratio` is that of its cells' volume to its voxels', usually within `near`; `is_whole` if all voxels count.
+    """
+    n_lost, n_pieces = len(row.lost_components), row.mesh_components
+    voxels, n_kept = sum(each.voxels for each in row.lost_components), row.components - n_lost
+    if not near[0] <= ratio <= near[1]:
+        what = "with less than {:g} or more than {:g} times the volume of voxels".format(*near)
+        yield what, min(ratio, 1.0 / max(ratio, near[0])), f"{ratio:.3g}"
+    if n_lost:
+        yield "with components without a cell", -voxels, f"{n_lost} of {row.components}, voxels: {voxels}"
+    if n_pieces > max(n_kept, 1):
+        yield "with more pieces of cells than of voxels", -n_pieces, f"{n_pieces}"
+    if is_whole and 0 < n_pieces < n_kept:
+        yield "with fewer pieces of cells than of voxels", n_pieces - n_kept, f"{n_pieces} of {n_kept}"
+    if surface is not None and is_whole and n_pieces and surface.mesh_cavities < surface.cavities:
+        n_left, n_all = surface.mesh_cavities, surface.cavities
+        yield "with fewer cavities in cells than in voxels", n_left - n_all, f"{n_left} of {n_all}"
 
 
 def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
@@ -200,8 +219,9 @@ def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
 
 
 def of_result(
-    result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any]
-) -> Iterator[Problem]:
+    result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
+    k_D: float | None = None, has_sizes: bool = False,
+) -> Iterator[Problem]:  # fmt: skip
     """Yield oddities of results that are valid but probably not intended.
 
     The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts.
@@ -217,7 +237,9 @@ def of_result(
             yield Problem(f"{text}, as no iteration was made", "allow some `iterations`")
         else:
             wants: Literal["smaller", "larger"] = "smaller" if n_nodes < nodes else "larger"
-            yield Problem(text, f"use more iterations, a `k_D` above 0, or {wants} sizes", wants=wants)
+            remedies = ["more iterations"] * (result.ended == "iterations") + ["a `k_D` above 0"] * (k_D == 0.0)
+            remedy = " or ".join([*remedies, *[f"{wants} sizes"] * has_sizes])
+            yield Problem(text, f"use {remedy}" if remedy else "", wants=wants if has_sizes else None)
     lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
     if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         text = f"E ended at {last.E:.4f}, above its minimum {lowest:.4f}: a tessellation in the first n_t iterations"

@@ -77,7 +77,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         first = first or time.perf_counter()
         started("kernels", KERNEL_WORDS)
         nodes = max(job.nodes or 0, len(initial.points)) if task.plan.order == 1 else len(initial.points)
-        note(f"{_described(task, initial)}; at most {memory_words(most_bytes(nodes))} of memory")
+        note(f"{_described(task, initial)}; about {memory_words(most_bytes(nodes))} of memory")
         _prepare(task)
         started("optimise", "optimising", options["iterations"], None if ends is None else ends - time.perf_counter())
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -205,7 +206,10 @@ def _labelling(
         return ReadLabels(tissue_labels(tissues), table, {}, is_own)
     if options.labels is None:
         return ReadLabels(table=table)
-    labels = beside(options.labels, resample_labels)
+    with warnings.catch_warnings():
+        if options.merge or options.crop or numbers:  # labels may be left out on purpose
+            warnings.filterwarnings("ignore", ".*labels without a voxel in the image")
+        labels = beside(options.labels, resample_labels)
     is_own = is_alone and np.array_equal(labels.data, image.data)
     return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
 
