@@ -11,6 +11,7 @@ from tetopt.contents.memberships import (
     FARTHEST_DISTANCE,
     finer,
     finer_affine,
+    labels_at,
     memberships,
     near_distance,
     supersampling,
@@ -226,3 +227,18 @@ def test_the_same_on_any_number_of_threads():
 def test_labels_must_be_whole_numbers():
     with pytest.raises(tetopt.InputError, match="labels must be whole numbers from 0"):
         memberships(tetopt.Image(np.array([[0.0, 1.5], [2.0, 3.0]])))
+
+
+def test_a_rod_of_one_voxel_between_two_labels_keeps_its_volume():
+    """Each of its neighbours' levels is right for its neighbour alone, and together they leave less for the rod."""
+    i, j, k = np.indices((24, 24, 24))
+    labels = np.where(i + j < 23, 1, 2)
+    labels[(i + j >= 22) & (i + j <= 23) & (abs(i - j - k + 12) <= 2)] = 3  # diagonal, where the two others meet
+    members = memberships(tetopt.Image(labels.astype(float), np.eye(4)))
+    place = np.stack(np.meshgrid(*3 * [np.arange(-0.375, 23.5, 0.25)], indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.repeat(np.arange(len(place))[:, None], 4, axis=1)
+    row = labels_at(members, place, cells, np.eye(1, 4))
+    assert (members.labels[members.partition] == labels).all()
+    for number, tolerance in ((1, 0.01), (2, 0.01), (3, 0.05)):
+        fraction = (row == number - 1).sum() / 64.0 / (labels == number).sum()
+        assert fraction == pytest.approx(1.0, abs=tolerance), number

@@ -35,6 +35,12 @@ VOLUME_SIGMA, VOLUME_BLOCK = (
 NEAR_SURFACE = 0.05, 0.95  # distance range of voxels next to the surface: below 1, and centres keep their label
 MOST_LIFTED = 1.0  # voxels by which smoothing may change levels farther off: the error of distances to voxels
 LEAST_SLOPE = 0.3  # least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
+AGREEMENT_ROUNDS = 8  # with none, ribs of a CT have .77 to .86 of their volume
+AGREEMENT_FRACTION = 0.02  # of a label's volume, whose lack or excess between labels is corrected
+AGREEMENT_STEP = 0.6  # of the missing depth: levels of thin labels are flat, so that a whole step goes too far
+AGREEMENT_REACH = 2  # voxels from a label within which its level is corrected, half of `APART_VOXELS` at most
+AGREEMENT_VOXELS, PLACES_PER_VOXEL = 20_000, 8  # of those near a label, about as many are sampled, at so many places
+PLASTIC_RATIO = 1.2207440846057596  # root of x^4 = x + 1, of Roberts' sequence in three dimensions
 FLOW_STEPS = 4  # more steps do not improve spheres of 3 to 20 voxels or shells of 2 to 6
 ABSENT_DISTANCE = 1e4  # voxels to a label that is absent from a slice
 
@@ -124,7 +130,53 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     members = gathered(values, start, level_in, prod(factors))
     if off.any():
         _merge_crumbs(members.levels, members.partition, members.channel, off == 0.0)
+    elif len(values) > 2:
+        _agree(members)
     return members
+
+
+def _agree(members: Memberships) -> None:
+    """Raise or lower levels, in place, until each label has its volume where its level is the smallest.
+
+    Where two labels meet, their levels are opposite. Where more meet, each level alone has the volume of its label,
+    but overlaps others: a rib between muscle and fat would lose a fifth. Every voxel's centre keeps its label.
+    """
+    due, partition = list(range(len(members.labels))), members.partition
+    boxes = [_around(box, partition.shape) for box in scipy.ndimage.find_objects(partition + 1)]
+    for _ in range(AGREEMENT_ROUNDS):
+        with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+            steps = list(threads.map(lambda row: _missing_depth(members, row, boxes[row]), due))
+        due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
+        for row, step in zip(due, filter(None, steps), strict=True):
+            inside, level = partition[boxes[row]] == row, members.levels[members.channel[row]][boxes[row]]
+            is_near, moved = _near(inside), level - np.float32(AGREEMENT_STEP * step)
+            level[is_near] = np.where(inside, np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0]))[
+                is_near
+            ]
+
+
+def _near(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Voxels so near to a label that no other label of its channel has its level there."""
+    return scipy.ndimage.maximum_filter(inside, 2 * AGREEMENT_REACH + 1)
+
+
+def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...]) -> float:
+    """Volume that a label lacks between labels, over its area, voxels; 0 if that is next to nothing of its volume.
+
+    Sampled at places in voxels near the label, quasi-random (Roberts' sequence R3), as regular ones would miss layers.
+    """
+    inside = members.partition[box] == row
+    place = np.flatnonzero(_near(inside))
+    place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)]
+    is_own, n = inside.ravel()[place], inside.ndim
+    at = np.stack(np.unravel_index(place, inside.shape), axis=1) + [side.start for side in box]
+    index = np.repeat(at, PLACES_PER_VOXEL, axis=0)
+    index = index + (np.arange(1, len(index) + 1)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, n + 1.0)) % 1.0 - 0.5
+    cells = np.broadcast_to(np.arange(len(index))[:, None], (len(index), n + 1))
+    fraction = (labels_at(members, index, cells, np.eye(1, n + 1)) == row).reshape(len(place), -1).mean(axis=1)
+    lacking = float((is_own - fraction).sum())
+    area = int(((fraction > 0.0) & (fraction < 1.0)).sum())
+    return lacking / area if area and abs(lacking) > AGREEMENT_FRACTION * is_own.sum() else 0.0
 
 
 def gathered(
