@@ -223,7 +223,7 @@ def test_volumes_of_labels():
         changed[other[: round(n_other * len(own))]] = 1
         ratios.append(volumes(mesh.points, mesh.cells)[changed == 1].sum() / 216.0)
         said = judged(mesh, target, changed).violated.get("labels", "")
-        words = f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.2g} for label 1; allow more"
+        words = f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.3g} for label 1; allow more"
         assert said.startswith(words) if not 0.6 <= ratios[-1] <= 1.5 else said == ""
     assert ratios[0] < 0.6 < ratios[1] < ratios[2] < 1.5 < ratios[3]
 

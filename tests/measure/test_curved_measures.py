@@ -90,7 +90,7 @@ def test_requirements_are_on_curved_cells(ball, monkeypatch):
     straight = result._replace(mesh=tetopt.Mesh(result.mesh.points, result.mesh.cells))
     before = checked(straight, content, 90.0, straight.mesh)
     assert sorted(before.violated) == ["labels", "min_dihedral"]
-    assert "0.95 for label 1;" in before.violated["labels"]
+    assert "0.945 for label 1;" in before.violated["labels"]
     assert checked_curved(before, content) is before
     curved = result._replace(violated=before.violated)
     assert sorted(checked_curved(curved, content).violated) == ["min_dihedral"]
