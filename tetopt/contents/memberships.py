@@ -149,10 +149,9 @@ def _agree(members: Memberships) -> None:
         due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
         for row, step in zip(due, filter(None, steps), strict=True):
             inside, level = partition[boxes[row]] == row, members.levels[members.channel[row]][boxes[row]]
-            is_near, moved = _near(inside), level - np.float32(AGREEMENT_STEP * step)
-            level[is_near] = np.where(inside, np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0]))[
-                is_near
-            ]
+            is_near = _near(inside)
+            is_own, moved = inside[is_near], level[is_near] - np.float32(AGREEMENT_STEP * step)
+            level[is_near] = np.where(is_own, np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0]))
 
 
 def _near(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
