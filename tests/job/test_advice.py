@@ -256,6 +256,17 @@ def test_remedies_of_a_missed_number_of_nodes_are_those_that_apply(said):
         assert said() == f"100 nodes instead of {nodes}; {words}\n"
 
 
+@pytest.mark.parametrize(("words", "has_sizes"), [([], False), (["--edge-max", "40"], True)])
+def test_only_requested_sizes_are_a_remedy(tmp_path, capsys, words, has_sizes):
+    """Order 2 has sizes of its own, which nobody asked for."""
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
+    few = ["--nodes", "400", "--order", "2", "--iterations", "1"]
+    assert exit_code("mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", *few, *words) == 0
+    err = capsys.readouterr().err
+    assert "nodes instead of 400; use more iterations" in err
+    assert (" sizes" in err) == has_sizes
+
+
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
     for slices, words in ((1.5, "reduce `nodes` to about 0"), (5.5, "slices are 5.5 mm apart")):
         told(*of_empty(ended(), 100, 1, np.array([1.0, 1.0, slices])))

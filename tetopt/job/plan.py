@@ -40,6 +40,7 @@ from tetopt.system.files import checked_output, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
+SIZE_NAMES = ("size_min", "edge_size", "edge_max", "gradation", "sizing", "cells_across", "label_size")  # of options
 
 
 class Plan(NamedTuple):
@@ -72,6 +73,11 @@ class Plan(NamedTuple):
     def order(self) -> int:
         """Order of the cells, 1 or 2; by default 1, linear."""
         return self.job.order or 1
+
+    @property
+    def has_sizes(self) -> bool:
+        """True if sizes were requested; order 2 has sizes of its own."""
+        return any(getattr(self.bare, name) is not None for name in SIZE_NAMES)
 
     @property
     def engine_options(self) -> dict[str, Any]:
@@ -172,16 +178,7 @@ def resolved(job: JobOptions) -> Plan:
     _check_numbers(job)
     check_solver_options(job.output, job)
     mode = _mode(job)
-    for name in (
-        "size_min",
-        "edge_size",
-        "edge_max",
-        "gradation",
-        "sizing",
-        "cells_across",
-        "label_size",
-        "target_error",
-    ):
+    for name in (*SIZE_NAMES, "target_error"):
         if mode != "graded" and getattr(job, name) is not None:
             raise InputError(
                 f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"

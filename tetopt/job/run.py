@@ -189,7 +189,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
-    has_sizes = task.sizes is not None
+    has_sizes = task.plan.has_sizes
     problems += of_result(outcome.result, job.method, mode, n_nodes, expected, measured, job.k_D, has_sizes)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
         sizes = task.sizes._replace(longest=task.plan.bare.edge_max)  # without a default
