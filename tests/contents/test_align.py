@@ -184,6 +184,7 @@ def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):
     whole, image = tetopt.Image(labels), tetopt.Image(np.zeros((11, 12)))
     tetopt.resample_labels(whole, image, "l")
     tetopt.resample_labels(whole, tetopt.Image(np.zeros((20, 12))), "l")
+    tetopt.resample_labels(whole, image, "left out on purpose", may_miss=True)
     mask = tetopt.Image(np.arange(20)[:, None] + np.zeros((20, 12)) < 15)
     tetopt.content(whole, whole, mask)
     tetopt.content(whole, whole, tetopt.Image(labels > 0.0))

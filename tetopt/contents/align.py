@@ -81,7 +81,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     return Image(moved, image.affine)
 
 
-def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
+def resample_labels(labels: Image, image: Image, name: str = "labels", *, may_miss: bool = False) -> Image:
     """Resample labels to the image's voxels: nearest neighbour by the affines if the grids differ, 0 outside their box.
 
     Parameters
@@ -93,6 +93,8 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         Image with the target voxels.
     name : str, optional
         Name of the labels in messages.
+    may_miss : bool, optional
+        True if labels may lie outside the image's box on purpose: no warning of these.
 
     Returns
     -------
@@ -126,7 +128,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
         if (labels.data * in_box(image, labels)).any():
             raise InputError(f"{name}: the labels are lost between the centres of the image's larger voxels")
         raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
-    if not is_same_grid(labels, image):
+    if not (may_miss or is_same_grid(labels, image)):
         warn_of_absent(f"{name}: ", labels, in_box(image, labels).astype(bool), "image")
     _warn_of_loss(name, "label", labels, Image(moved, image.affine))
     return Image(moved, image.affine)

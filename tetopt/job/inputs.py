@@ -102,7 +102,7 @@ class Aligned(NamedTuple):
     """An image, and a function that reads other files and aligns them to it."""
 
     image: Image
-    beside: Callable[[Path, Callable[[Image, Image, str], Image]], Image]
+    beside: Callable[..., Image]
     factors: tuple[int, ...]  # parts of the file's voxels along each axis
 
 
@@ -123,12 +123,12 @@ def image_and_others(image: Image, path: Path, part: ImagePart, originals: Origi
             ]
         image = whole if slice_ is None else part_of(whole, slice_, crop)
 
-    def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
+    def beside(other: Path, aligned: Callable[..., Image], **options: bool) -> Image:
         original = originals.get((other, aligned)) or read_companion(other, part.spacing_mm)
         warn_of_other_world(path, other)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
-        moved = aligned(original, grid, str(other))
+        moved = aligned(original, grid, str(other), **options)
         moved = divided(moved, factors) if aligned is resample_contrast else moved
         is_cropped = slice_ is None and crop is not None
         if not is_same_grid(original, grid, is_cropped=is_cropped):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -206,10 +205,8 @@ def _labelling(
         return ReadLabels(tissue_labels(tissues), table, {}, is_own)
     if options.labels is None:
         return ReadLabels(table=table)
-    with warnings.catch_warnings():
-        if options.merge or options.crop or numbers:  # labels may be left out on purpose
-            warnings.filterwarnings("ignore", ".*labels without a voxel in the image")
-        labels = beside(options.labels, resample_labels)
+    is_partial = bool(options.merge or options.crop or numbers)  # labels may be left out on purpose
+    labels = beside(options.labels, resample_labels, may_miss=is_partial)
     is_own = is_alone and np.array_equal(labels.data, image.data)
     return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
 
