@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,12 +88,15 @@ class Mesh:
         """Number of space dimensions n, 2 or 3."""
         return self.points.shape[1]
 
-    @property
+    @cached_property
     def cell_volumes(self) -> NDArray[np.float64]:
-        """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved edges."""
+        """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved edges. Read-only."""
         if self.midpoints is None:
-            return volumes(self.points, self.cells)
-        return curved_volumes(*quadratic(self.points, self.cells, self.midpoints))
+            sizes = volumes(self.points, self.cells)
+        else:
+            sizes = curved_volumes(*quadratic(self.points, self.cells, self.midpoints))
+        sizes.setflags(write=False)
+        return sizes
 
     def straight_pieces(self) -> tuple[Mesh, int]:
         """Split cells with curved edges into straight ones, on which surfaces and overlaps are measured.
@@ -112,8 +116,11 @@ class Mesh:
         >>> n_pieces, [round(float(each.cell_volumes.sum()), 4) for each in (mesh, pieces)]
         (4, [0.5667, 0.55])
         """
-        if self.midpoints is None:
-            return self, 1
+        return (self, 1) if self.midpoints is None else self._pieces
+
+    @cached_property
+    def _pieces(self) -> tuple[Mesh, int]:
+        assert self.midpoints is not None, "a straight mesh is its own pieces: no reference to itself"
         points, cells = straight_pieces(self.points, self.cells, self.midpoints)
         return Mesh(points, cells), len(cells) // len(self.cells)
 

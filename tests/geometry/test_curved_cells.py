@@ -139,6 +139,9 @@ def test_pieces_of_curved_cells(n):
     )
     straight = tetopt.Mesh(mesh.points, mesh.cells)
     assert straight.straight_pieces() == (straight, 1)
+    assert mesh.straight_pieces()[0] is pieces  # made once
+    assert all(each.cell_volumes is each.cell_volumes for each in (mesh, straight))
+    assert not any(each.cell_volumes.flags.writeable for each in (mesh, straight))
     middles = mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)
     equal = tetopt.Mesh(mesh.points, mesh.cells, middles).straight_pieces()[0].cell_volumes
     np.testing.assert_allclose(equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9)
