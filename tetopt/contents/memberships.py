@@ -143,15 +143,17 @@ def _agree(members: Memberships) -> None:
     """
     due, partition = list(range(len(members.labels))), members.partition
     boxes = [_around(box, partition.shape) for box in scipy.ndimage.find_objects(partition + 1)]
-    for _ in range(AGREEMENT_ROUNDS):
-        with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-            steps = list(threads.map(lambda row: _missing_depth(members, row, boxes[row]), due))
-        due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
-        for row, step in zip(due, filter(None, steps), strict=True):
-            inside, level = partition[boxes[row]] == row, members.levels[members.channel[row]][boxes[row]]
-            is_near = _near(inside)
-            is_own, moved = inside[is_near], level[is_near] - np.float32(AGREEMENT_STEP * step)
-            level[is_near] = np.where(is_own, np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0]))
+    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+        nears = list(threads.map(lambda row, box: _near(partition[box] == row), due, boxes))
+        for _ in range(AGREEMENT_ROUNDS):
+            steps = list(threads.map(lambda row: _missing_depth(members, row, boxes[row], nears[row]), due))
+            due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
+            for row, step in zip(due, filter(None, steps), strict=True):
+                level, is_near = members.levels[members.channel[row]][boxes[row]], nears[row]
+                is_own = partition[boxes[row]][is_near] == row
+                moved = level[is_near] - np.float32(AGREEMENT_STEP * step)
+                least, most = np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0])
+                level[is_near] = np.where(is_own, least, most)
 
 
 def _near(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -159,13 +161,12 @@ def _near(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return scipy.ndimage.maximum_filter(inside, 2 * AGREEMENT_REACH + 1)
 
 
-def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...]) -> float:
+def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], is_near: NDArray[np.bool_]) -> float:
     """Volume that a label lacks between labels, over its area, voxels; 0 if that is next to nothing of its volume.
 
     Sampled at places in voxels near the label, quasi-random (Roberts' sequence R3), as regular ones would miss layers.
     """
-    inside = members.partition[box] == row
-    place = np.flatnonzero(_near(inside))
+    inside, place = members.partition[box] == row, np.flatnonzero(is_near)
     place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)]
     is_own, n = inside.ravel()[place], inside.ndim
     at = np.stack(np.unravel_index(place, inside.shape), axis=1) + [side.start for side in box]

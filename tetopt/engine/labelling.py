@@ -193,10 +193,11 @@ def unpinched(
 
     Arguments as for `labelled`; no label loses its last cell. Pinches that cannot be mended remain.
     """
-    labels = labels.copy()
-    for each in (contacts, None):  # false contact may forbid all moves that are left
-        dual = _dual(points, cells, across, counts, each, None)
-        _mend_pairs(dual, labels, np.repeat([[float(dual.size.min())], [np.inf]], counts.shape[1], axis=1))
+    labels, dual = labels.copy(), _dual(points, cells, across, counts, contacts, None)
+    bounds = np.repeat([[float(dual.size.min())], [np.inf]], counts.shape[1], axis=1)
+    nowhere = _no_contacts(len(cells), counts.shape[1])
+    for each in (dual.contacts, nowhere):  # false contact may forbid all moves that are left
+        _mend_pairs(dual._replace(contacts=each), labels, bounds)
     return labels
 
 
@@ -306,11 +307,13 @@ def _dual(
         counts.indptr.astype(np.int64),
         counts.indices.astype(np.int64),
         voxel * counts.data.astype(np.float64),
-        Contacts(np.zeros((n_labels, n_labels), dtype=bool), np.zeros(len(cells), dtype=bool))
-        if contacts is None
-        else contacts,
+        contacts or _no_contacts(len(cells), n_labels),
         np.zeros(n_labels),
     )
+
+
+def _no_contacts(n_cells: int, n_labels: int) -> Contacts:
+    return Contacts(np.zeros((n_labels, n_labels), dtype=bool), np.zeros(n_cells, dtype=bool))
 
 
 def _majority(dual: Dual) -> NDArray[np.int64]:
