@@ -145,11 +145,11 @@ def test_faults_that_are_skipped_are_none(monkeypatch, n):
     """The same labels whether or not sound nodes, and those where nothing changed, are skipped, for random content."""
     mend, n_skipped = labelling._mend, 0
 
-    def without_marks(dual, labels, room, is_bridge, faces, is_near, is_sound, is_due, work):
+    def without_marks(dual, labels, room, is_bridge, faces, marks, work):
         nonlocal n_skipped
-        n_skipped += np.count_nonzero(is_sound)
-        is_due[:] = True
-        mend(dual, labels, room, is_bridge, faces, is_near, np.zeros_like(is_sound), is_due, work)
+        n_skipped += np.count_nonzero(marks.is_sound)
+        marks.is_due[:] = True
+        mend(dual, labels, room, is_bridge, faces, marks._replace(is_sound=np.zeros_like(marks.is_sound)), work)
 
     for seed in range(8):
         rng = np.random.default_rng(seed)

@@ -163,17 +163,16 @@ def _given(
     if dual.bias.any():
         _keep_each(dual, labels, aim)
     _settle(dual, labels, bounds[0], False)
-    is_bridge = np.zeros(len(labels), dtype=bool)
-    is_near, is_sound, is_due = np.ones((3, len(dual.scale)), dtype=bool)
+    is_bridge, marks = np.zeros(len(labels), dtype=bool), _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
     mended = np.full(len(labels), -1)
     for _ in range(MENDING_ROUNDS):
         before = labels.copy(), is_bridge.copy()
         _without_fragments(dual, labels, is_bridge, aim, voxel, components)
         # Where nothing changed since mending failed, it fails again.
-        is_near[dual.cells[labels != mended]] = True
-        is_due[dual.cells[is_near[dual.cells].any(axis=1)]] = True
-        is_near[:] = is_due
-        _mend_near(dual, labels, is_bridge, bounds, is_near, is_sound, is_due)
+        marks.is_near[dual.cells[labels != mended]] = True
+        marks.is_due[dual.cells[marks.is_near[dual.cells].any(axis=1)]] = True
+        marks.is_near[:] = marks.is_due
+        _mend_near(dual, labels, is_bridge, bounds, marks)
         mended = labels.copy()
         _settle(dual, labels, bounds[0], True)
         if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
@@ -631,6 +630,14 @@ class _Work(NamedTuple):
     steps: Ints1  # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
 
 
+class _Marks(NamedTuple):
+    """Marks of nodes (N,) for mending."""
+
+    is_near: Bools1  # of a changed cell: places there are to be searched
+    is_sound: Bools1  # no place there is known to have a fault
+    is_due: Bools1  # places there may be mended later
+
+
 def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
     star, label, own, root, fan, fan_label = np.empty((6, widest + 1), dtype=np.int64)
@@ -656,9 +663,8 @@ def _nonmanifold(
 
 
 def _mend_near(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], bounds: NDArray[np.float64],
-    is_near: NDArray[np.bool_], is_sound: NDArray[np.bool_], is_due: NDArray[np.bool_],
-) -> None:  # fmt: skip
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], bounds: NDArray[np.float64], marks: _Marks
+) -> None:
     """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
 
     Bridges stay, and labels keep within the `bounds` of their volumes: see `_bounds`. Afterwards no node is marked
@@ -666,13 +672,13 @@ def _mend_near(
     where mending may succeed.
     """
     room = _room(dual, labels, bounds)
-    while is_near.any():
-        faces = _nonmanifold(dual, labels, is_near)[0]
-        is_sound[is_near] = True
-        is_sound[faces[faces >= 0]] = False
-        is_due[is_near] = False  # all places at these nodes are tried
-        is_near[:] = False
-        _mend(dual, labels, room, is_bridge, faces, is_near, is_sound, is_due, _work(dual))
+    while marks.is_near.any():
+        faces = _nonmanifold(dual, labels, marks.is_near)[0]
+        marks.is_sound[marks.is_near] = True
+        marks.is_sound[faces[faces >= 0]] = False
+        marks.is_due[marks.is_near] = False  # all places at these nodes are tried
+        marks.is_near[:] = False
+        _mend(dual, labels, room, is_bridge, faces, marks, _work(dual))
 
 
 def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -683,11 +689,11 @@ def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) ->
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> None:
     """Mend the remaining places between two labels, even if that removes a bridge."""
-    is_bridge, marks = np.zeros(len(labels), dtype=bool), np.zeros((3, len(dual.scale)), dtype=bool)
+    is_bridge, marks = np.zeros(len(labels), dtype=bool), _Marks(*np.zeros((3, len(dual.scale)), dtype=bool))
     for _ in range(MENDING_ROUNDS):
         faces, is_two = _nonmanifold(dual, labels)
         before, room = labels.copy(), _room(dual, labels, bounds)
-        _mend(dual, labels, room, is_bridge, faces[is_two], *marks, _work(dual))
+        _mend(dual, labels, room, is_bridge, faces[is_two], marks, _work(dual))
         if np.array_equal(before, labels):
             break
 
@@ -911,13 +917,12 @@ def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
 
 @entry
 def _mend(
-    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, is_near: Bools1, is_sound: Bools1,
-    is_due: Bools1, work: _Work,
-) -> None:  # fmt: skip
+    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, marks: _Marks, work: _Work
+) -> None:
     """At each place that is not manifold, make the move that most lowers the energy including pinches.
 
-    Nodes of changed cells are marked in `is_near`, and no longer in `is_sound`. In `is_due`, nodes are marked whose
-    places may be mended later: those with a cell that has a node of a changed one, or that a label's room kept.
+    Nodes of changed cells are marked near, and no longer sound. Nodes are marked due whose places may be mended later:
+    those with a cell that has a node of a changed one, or that a label's room kept.
     """
     star, group = np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
@@ -933,12 +938,12 @@ def _mend(
                 continue
             volume = dual.size[group[:size]].sum()
             if room[0, labels[group[0]]] < volume:
-                is_due[a] = True
+                marks.is_due[a] = True
                 continue
             can_grow = room[-1 if is_false else 1] >= volume
             for cell in star[:count]:
-                is_due[a] = is_due[a] or not can_grow[labels[cell]]
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, is_sound, work)
+                marks.is_due[a] = marks.is_due[a] or not can_grow[labels[cell]]
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, marks, work)
             if new >= 0:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
@@ -951,10 +956,10 @@ def _mend(
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
                     node = dual.cells[cell, k]
-                    is_near[node], is_sound[node] = True, False
+                    marks.is_near[node], marks.is_sound[node] = True, False
                     for r in range(dual.star_start[node], dual.star_start[node + 1]):
                         for m in range(dual.cells.shape[1]):
-                            is_due[dual.cells[dual.star_cells[r], m]] = True
+                            marks.is_due[dual.cells[dual.star_cells[r], m]] = True
 
 
 @unit
@@ -985,7 +990,7 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
 
 @unit
 def _best_of_group(
-    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, can_grow: Bools1, is_sound: Bools1, work: _Work
+    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, can_grow: Bools1, marks: _Marks, work: _Work
 ) -> tuple[int, float]:
     """The label in the star that may grow and lowers the energy most for the group, and the change.
 
@@ -1004,7 +1009,7 @@ def _best_of_group(
             faces = _closure(dual, group)
             before, pinches = _prices(dual, labels, group), 0.0
             for f in range(len(faces)):
-                if not (is_sound[faces[f, 0]] or (faces[f, 1] >= 0 and is_sound[faces[f, 1]])):
+                if not (marks.is_sound[faces[f, 0]] or (faces[f, 1] >= 0 and marks.is_sound[faces[f, 1]])):
                     pinches += _pinches(dual, labels, faces[f : f + 1], 0.0, np.inf, work)
         for cell in group:
             labels[cell] = new
