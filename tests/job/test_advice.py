@@ -9,10 +9,21 @@ from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.requirements import LABEL_REMEDY
-from tetopt.job.advice import agreed, beyond_requirements, of_empty, of_result, of_sizes, sentences, tell, unmet
+from tetopt.job.advice import (
+    agreed,
+    beyond_requirements,
+    of_empty,
+    of_result,
+    of_sizes,
+    sentences,
+    tell,
+    tell_label_sizes,
+    unmet,
+)
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
+from tetopt.start.label_sizes import sizes_by_label
 from tetopt.start.sizes import EdgeRatios, Sizes
 
 NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
@@ -265,6 +276,19 @@ def test_only_requested_sizes_are_a_remedy(tmp_path, capsys, words, has_sizes):
     err = capsys.readouterr().err
     assert "nodes instead of 400; use more iterations" in err
     assert (" sizes" in err) == has_sizes
+
+
+def test_nodes_that_do_not_suffice_are_called_the_least(said):
+    """More nodes make all other cells smaller, so that sizes take more; not if other cells have a size."""
+    data = np.zeros((24, 24, 24))
+    data[4:20, 4:20, 4:20], data[10:13, 4:20, 4:20] = 1.0, 2.0
+    what = tetopt.content(tetopt.Image(data), tetopt.Image(data))
+    for edge_size, is_least in ((None, True), (6.0, False)):
+        made = sizes_by_label(Sizes(cells_across=1, edge_size=edge_size), what, 100)
+        again = sizes_by_label(Sizes(cells_across=1, edge_size=edge_size), what, made.nodes)
+        assert (again.scale > 1.0) == is_least
+        tell_label_sizes(made)
+        assert f"sizes by label require {'at least' if is_least else 'about'} {made.nodes} nodes" in said()
 
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):

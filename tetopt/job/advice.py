@@ -282,9 +282,14 @@ def of_empty(
 
 
 def tell_label_sizes(sizes: SizesByLabel) -> None:
-    """Report the nodes that sizes by label take; what the mesh has is measured afterwards (`of_layers`)."""
+    """Report the nodes that sizes by label take; what the mesh has is measured afterwards (`of_layers`).
+
+    With more nodes, cells elsewhere are smaller, which takes more still, unless they have a size of their own.
+    """
+    is_least = sizes.scale > 1.0 and sizes.sizes.edge_size is None
+    which, enough = ("at least", " (leave out `nodes` to have enough)") if is_least else ("about", "")
     larger = "" if sizes.scale == 1.0 else f"; with fewer nodes, edges are {sizes.scale:.2f} times as long"
-    note(f"sizes by label require about {sizes.nodes} nodes{larger}")
+    note(f"sizes by label require {which} {sizes.nodes} nodes{enough}{larger}")
 
 
 def of_layers(labels: Iterable[LabelFidelity], cells_across: float, names: Mapping[int, str]) -> Iterator[Problem]:

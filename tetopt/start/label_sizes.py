@@ -115,7 +115,8 @@ class SizesByLabel(NamedTuple):
     sizes : Sizes
         Sizes with a field of targets.
     nodes : int
-        Approximate number of nodes that the requested sizes take.
+        Approximate number of nodes that the requested sizes take; without `edge_size` more if there are more nodes, as
+        cells outside thin labels become smaller.
     scale : float
         Factor by which they are larger than requested to meet a lower number of nodes; else 1.
     layers : list of LabelLayers
