@@ -8,7 +8,7 @@ from tetopt.contents.domain import Region, levels, region_of
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import mask_fidelity
-from tetopt.start.clip import clipped, lattice_within, onto_surface
+from tetopt.start.clip import clipped, lattice_within, lost_fraction, onto_surface
 
 
 def test_a_sphere_has_no_stairs():
@@ -145,6 +145,20 @@ def test_a_wall_as_thick_as_its_cells_is_whole():
     image = tetopt.Image(1.0 * mask)
     mesh = lattice_within(image, region_of(image), spacing=3.0)
     assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(mask.sum(), rel=0.04)
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((44, 22, 22), 4.0), ((44, 22), 6.0)])
+def test_what_flat_facets_cut_off_is_not_lost(shape, spacing):
+    """Of two balls, neither is lost in a coarse mesh; without the cells of one, half is."""
+    middle, affine = [10.6] * (len(shape) - 1), np.diag([-2.0, 1.0, 1.0, 1.0][-len(shape) - 1 :])  # mirrored in 3-D
+    inside = np.minimum(distance(shape, 10.6, *middle), distance(shape, 32.6, *middle)) < 8.0
+    image = tetopt.Image(1.0 * inside, affine)
+    region = region_of(image)
+    mesh = lattice_within(image, region, spacing=spacing)
+    assert mesh.cell_volumes.sum() < 0.97 * inside.sum() * image.voxel_volume
+    assert abs(lost_fraction(mesh, image, region)) < 0.01
+    one = mesh.cells[image.to_index(mesh.points)[mesh.cells].mean(axis=1)[:, 0] < 22.0]
+    assert lost_fraction(tetopt.Mesh(mesh.points, one), image, region) == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.full

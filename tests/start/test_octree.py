@@ -9,6 +9,7 @@ from scipy import ndimage
 
 import tetopt
 from tetopt.contents.noise import noise_level
+from tetopt.start import octree
 from tetopt.start.octree import _dilated, octree_mesh
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
@@ -213,3 +214,26 @@ def test_rings_of_blocks(shape, n_rings):
     before = chosen.copy()
     np.testing.assert_array_equal(_dilated(chosen, n_rings), ndimage.maximum_filter(chosen, size=2 * n_rings + 1))
     np.testing.assert_array_equal(chosen, before)
+
+
+def test_a_wall_thinner_than_the_cells_is_whole():
+    """Of a shell of two voxels, an octree of 500 nodes would lose a third; it has more, which the run removes."""
+    off = np.abs(np.linalg.norm(grid(26, 26, 26) - 12.5, axis=-1) - 9.0)
+    mask = tetopt.Image(1.0 * (off < 1.0))
+    content, ideal = tetopt.content(mask, mask=mask), 4.0 / 3.0 * np.pi * (10.0**3 - 8.0**3)
+    start = octree_mesh(content, 500)
+    assert 500 < len(start.points) < 2000
+    assert start.cell_volumes.sum() == pytest.approx(ideal, rel=0.02)
+    result = tetopt.mesh_image(content, nodes=500)
+    assert len(result.mesh.points) == 500
+    assert result.mesh.cell_volumes.sum() == pytest.approx(ideal, rel=0.015)
+    assert result.violated == {}
+
+
+def test_a_mask_that_no_octree_keeps_has_the_nearest_number_of_nodes(monkeypatch):
+    off = np.abs(np.linalg.norm(grid(60, 60, 60) - 29.5, axis=-1) - 25.0)
+    mask = tetopt.Image(1.0 * (off < 1.0))
+    content = tetopt.content(mask, mask=mask)
+    mesh = octree_mesh(content, 300)
+    monkeypatch.setattr(octree, "FINER_STEPS", 0)
+    np.testing.assert_array_equal(mesh.points, octree_mesh(content, 300).points)

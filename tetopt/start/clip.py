@@ -6,6 +6,8 @@ side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
 
 from __future__ import annotations
 
+from math import factorial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, is_on_sides
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.simplex import squared_edges, volumes
-from tetopt.geometry.topology import compact
+from tetopt.geometry.topology import boundary_facets, compact
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
@@ -52,6 +54,22 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
         raise InputError("mask: it is thinner than the cells, so no cell is left inside; increase the number of nodes")
     used, kept = compact(cells[is_inside], len(index))
     return Mesh(image.to_world(index[used]), kept)
+
+
+def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
+    """Fraction of a region's volume, as of thin walls, without cells, apart from what a mesh's flat facets cut off.
+
+    Facets with corners on a round surface have on average n / (n + 1) of the depth of their centres within it.
+    """
+    index = image.to_index(mesh.points)
+    facets = boundary_facets(mesh.cells)
+    centre = index[facets].mean(axis=1)
+    is_open = ~is_on_sides(centre, box_sides(image.shape)).any(axis=(1, 2))
+    edges = index[facets[is_open, 1:]] - index[facets[is_open, :1]]
+    area = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1))) / factorial(image.ndim - 1)
+    depth = -levels(region.level, centre[is_open]) * image.ndim / (image.ndim + 1)
+    covered = mesh.cell_volumes.sum() / image.voxel_volume + (area * depth).sum()
+    return float(1.0 - covered / region.inside.sum())
 
 
 def _sides(level: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
