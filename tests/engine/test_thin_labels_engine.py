@@ -11,7 +11,7 @@ import tetopt
 from tetopt.contents.memberships import labels_at, memberships
 from tetopt.engine.fast import BAND_FRACTION, MOST_OFFSET_FRACTION, Run
 from tetopt.engine.interfaces import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
-from tetopt.engine.labelling import Contacts, label_voxels, labelled
+from tetopt.engine.labelling import label_voxels, labelled
 from tetopt.engine.surface import fill_offsets
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.interfaces import label_interfaces
@@ -140,21 +140,6 @@ def test_a_slab_thinner_than_cells_keeps_its_volume(fullest):
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
     made = labelled(points, cells, across, counts, NO_COMPONENTS[:2], weight=1e-3)
     assert size[made == 1].sum() / (share * size).sum() == pytest.approx(1.0, abs=0.2)
-
-
-def test_a_pierced_sheet_is_closed_at_the_cost_of_volume():
-    """Labels that do not touch in the voxels do not meet at cells that are less than half of the sheet between them."""
-    points, cells, across, size, share = slab(3, 6)
-    below = points[cells].mean(axis=1)[:, 0] < points[cells].mean(axis=1)[:, 0].mean()
-    is_sheet = share > 0.0
-    share = np.where(share > 0.37, 0.45, 1.0) * is_sheet
-    counts = csr_array(np.column_stack([size * (1.0 - share) * below, share * size, size * (1.0 - share) * ~below]))
-    apart = np.array([[False, False, True], [False, False, False], [True, False, False]])
-    contacts = Contacts(apart, np.zeros(len(cells), dtype=bool))
-    made = labelled(points, cells, across, counts, NO_COMPONENTS, contacts, keeps_volumes=False, weight=1e-6)
-    assert (share[is_sheet] < 0.5).sum() > 5
-    assert contact(tetopt.Mesh(points, cells), made, 0, 2) == 0.0
-    assert 1.05 < size[made == 1].sum() / (share * size).sum() < 1.2
 
 
 def test_pairs_that_do_not_touch():

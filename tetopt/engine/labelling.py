@@ -38,7 +38,6 @@ TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, 
 # tenth and a fifth of the whole volume, Dice of white matter is .866, not .884 (MNI152, 5,000 nodes), and ribs of a CT
 # have .57 of their volume, not .68
 LARGEST_LOSS, LARGEST_GAIN = 0.1, 0.05
-LARGEST_FALSE_GAIN = 0.2  # the same to end false contact, of which 30 % less remains (CT with 41 labels, 4,000 nodes)
 FRAGMENT_FRACTION = 0.1  # of a label's volume: larger components of cells are not given away
 # of a label's volume, at least and at most, at the end, while two labels have pinches: with the last pair alone, a ball
 # of 46 cells loses a third
@@ -143,16 +142,16 @@ def labelled(
 
 
 def _bounds(dual: Dual, aim: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bounds of labels' volumes, (3, K) mm^n, that tension and mending keep to: least, largest, and for false contact.
+    """Least and largest volumes of labels, (2, K) mm^n, that tension and mending must keep to.
 
-    The last holds in place of the largest for moves that end false contact. The volume near a label's surface is that
-    of its voxels but for those in cells that, like all cells beside them, have most of it.
+    The volume near a label's surface is that of its voxels but for those in cells that, like all cells beside them,
+    have most of it.
     """
     labels, cell = _majority(dual), np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
     beside = np.where(dual.across >= 0, labels[dual.across], labels[:, None])
     is_inner = (beside == labels[:, None]).all(axis=1)[cell] & (dual.row == labels[cell])
     near = aim - np.bincount(dual.row[is_inner], dual.volume[is_inner], len(aim))
-    return aim + np.multiply.outer((-LARGEST_LOSS, LARGEST_GAIN, LARGEST_FALSE_GAIN), near)
+    return np.stack([aim - LARGEST_LOSS * near, aim + LARGEST_GAIN * near])
 
 
 def _given(
@@ -667,9 +666,9 @@ def _mend_near(
 ) -> None:
     """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
 
-    Bridges stay, and labels keep within the `bounds` of their volumes: see `_bounds`. Afterwards no node is marked
-    near; those with a fault there or at an edge, or near a change, are no longer marked sound; and those remain due
-    where mending may succeed.
+    Bridges stay, and labels keep within the `bounds` of their volumes, (2, K). Afterwards no node is marked near; those
+    with a fault there or at an edge, or near a change, are no longer marked sound; and those remain due where mending
+    may succeed.
     """
     room = _room(dual, labels, bounds)
     while marks.is_near.any():
@@ -682,9 +681,9 @@ def _mend_near(
 
 
 def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Volumes that labels may lose and gain, of the shape of the `bounds` of theirs."""
+    """Volumes that labels may lose and gain, (2, K), within the `bounds` of theirs."""
     volume = np.bincount(labels, dual.size, bounds.shape[1])
-    return np.vstack([volume - bounds[0], bounds[1:] - volume])
+    return np.stack([volume - bounds[0], bounds[1] - volume])
 
 
 def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> None:
@@ -930,7 +929,6 @@ def _mend(
         if _fault(dual, labels, a, b, work)[0] == 0.0:
             continue
         count = _gather(dual, a, b, star)
-        is_false = _has_false_contact(dual, count, _tell_apart(labels, count, work), work)
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
         for i in range(2 * count):
             size = _group(dual, labels, a, b, star[:count], i, group)
@@ -940,7 +938,7 @@ def _mend(
             if room[0, labels[group[0]]] < volume:
                 marks.is_due[a] = True
                 continue
-            can_grow = room[-1 if is_false else 1] >= volume
+            can_grow = room[1] >= volume
             for cell in star[:count]:
                 marks.is_due[a] = marks.is_due[a] or not can_grow[labels[cell]]
             new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, marks, work)
@@ -951,7 +949,7 @@ def _mend(
             volume = dual.size[group[:size]].sum()
             for label, gain in ((labels[group[0]], -volume), (best_label, volume)):
                 room[0, label] += gain
-                room[1:, label] -= gain
+                room[1, label] -= gain
             for cell in group[:size]:
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
