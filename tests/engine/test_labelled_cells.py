@@ -160,6 +160,25 @@ def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
     assert (n_fitted > 5) == has_mask  # whose misfit falls by more than the energy of the cells around
 
 
+def lengths(state, target, grid):
+    """Edges (a, b), their lengths, and the mean length of each node's edges, as many times as they have cells."""
+    mesh = parts(state, target, grid)[0]
+    pairs = np.concatenate([mesh.cells[:, [k, m]] for k in range(4) for m in range(k)])
+    length = np.linalg.norm(mesh.points[pairs[:, 0]] - mesh.points[pairs[:, 1]], axis=1)
+    return pairs, length, np.bincount(pairs.ravel(), np.repeat(length, 2)) / np.bincount(pairs.ravel())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nodes_do_not_meet_on_the_way_to_a_surface(labelled_state, name):
+    """No edge becomes shorter than about a third of those around it; means change while neighbours move."""
+    state, target, grid = labelled_state(name, 700)
+    pairs, before, mean = lengths(state, target, grid)
+    assert (before > 0.45 * mean[pairs].min(axis=1)).all()
+    pairs, after, mean = lengths(attracted(state), target, grid)
+    assert (after != before).any()
+    assert (after > 0.3 * mean[pairs].min(axis=1)).all()
+
+
 def test_energy_falls_with_labels(labelled_state):
     """Sweeps and flips never raise E, tension and voxels of other labels with it."""
     state, _, _ = labelled_state("balls")

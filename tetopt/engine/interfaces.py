@@ -17,7 +17,7 @@ from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, node_stars
-from tetopt.engine.labelling import Contacts, LabelVoxels, label_voxels, labelled, unpinched
+from tetopt.engine.labelling import Contacts, LabelVoxels, label_voxels, labelled, unfit_labels, unpinched
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
@@ -61,10 +61,15 @@ def with_labels(
 
 
 def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> None:
-    """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
+    """Give cells other labels where an interface of two labels is no manifold, or a label's cells are next to nothing.
+
+    No node moves.
+    """
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
-    if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
+    aim = image.voxel_volume * np.array([sizes.sum() for sizes in voxels.components])
+    is_unfit = unfit_labels(labels, np.abs(volumes(mesh.points, mesh.cells)), aim)
+    if is_unfit.any() or any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
         counts, contacts = cell_contents(image, members, mesh, voxels)
         labels[:] = unpinched(mesh.points, mesh.cells, across, counts, contacts, labels)
         _meet_everywhere(state, node_stars(state))

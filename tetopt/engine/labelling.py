@@ -42,7 +42,7 @@ FRAGMENT_FRACTION = 0.1  # of a label's volume: larger components of cells are n
 # of a label's volume, at least and at most, at the end, while two labels have pinches: with the last pair alone, a ball
 # of 46 cells loses a third
 LAST_FRACTIONS = (0.9, 1.2), (0.65, 1.5), (0.05, 3.0)
-UNFIT_FRACTION = 0.3  # of the volume of a label smaller than a cell: if its cells have no more, it is dropped
+UNFIT_FRACTION = 0.3  # of the volume of a label, or of a mean cell if that is less: with no more, it is dropped
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
 COMPONENT_FRACTION = 0.5
 BRIDGE_RATIO = 3.0  # cost of a bridge relative to the voxels lost otherwise; with 1 a coarse mesh loses half a rib
@@ -105,7 +105,7 @@ def labelled(
 
     The iteration ends, since every move except that of fragments lowers an energy, and fragments are moved at most
     `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps at least one cell, unless
-    it is smaller than a cell and has next to nothing of it (`UNFIT_FRACTION`).
+    its cells have next to nothing of it or of a mean cell (`UNFIT_FRACTION`).
 
     Parameters
     ----------
@@ -176,8 +176,7 @@ def _given(
         _settle(dual, labels, bounds[0], True)
         if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
             break
-    is_unfit = (np.bincount(labels, dual.size, len(aim)) < UNFIT_FRACTION * aim) & (aim < dual.size.mean())
-    _give_away(dual, labels, is_unfit[labels])
+    _without_unfit(dual, labels, aim)
     for each in LAST_FRACTIONS:
         _mend_pairs(dual, labels, np.multiply.outer(each, aim))
     return labels
@@ -189,14 +188,26 @@ def unpinched(
 ) -> NDArray[np.int64]:  # fmt: skip
     """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold, at any cost.
 
-    Arguments as for `labelled`; no label loses its last cell. Pinches that cannot be mended remain.
+    Arguments as for `labelled`. Labels that moves have left without a fit cell are dropped; no other loses its last
+    cell. Pinches that cannot be mended remain.
     """
     labels, dual = labels.copy(), _dual(points, cells, across, counts, contacts, None)
     bounds = np.repeat([[float(dual.size.min())], [np.inf]], counts.shape[1], axis=1)
     nowhere = _no_contacts(len(cells), counts.shape[1])
+    _without_unfit(dual, labels, np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64))
     for each in (dual.contacts, nowhere):  # false contact may forbid all moves that are left
         _mend_pairs(dual._replace(contacts=each), labels, bounds)
     return labels
+
+
+def unfit_labels(labels: NDArray[np.int64], size: NDArray[np.float64], aim: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask of the labels, (K,), whose cells are next to nothing of their volume `aim`, (K,) mm^n, or of a mean cell."""
+    volume = np.bincount(labels, size, len(aim))
+    return (volume > 0.0) & (volume < UNFIT_FRACTION * np.minimum(aim, size.mean()))
+
+
+def _without_unfit(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
+    _give_away(dual, labels, unfit_labels(labels, dual.size, aim)[labels])
 
 
 def _keep_each(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
