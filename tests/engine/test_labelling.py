@@ -145,11 +145,12 @@ def test_faults_that_are_skipped_are_none(monkeypatch, n):
     """The same labels whether or not sound nodes, and those where nothing changed, are skipped, for random content."""
     mend, n_skipped = labelling._mend, 0
 
-    def without_marks(dual, labels, room, is_bridge, faces, marks, work):
+    def without_marks(*arguments):
         nonlocal n_skipped
+        *rest, marks, work = arguments
         n_skipped += np.count_nonzero(marks.is_sound)
         marks.is_due[:] = True
-        mend(dual, labels, room, is_bridge, faces, marks._replace(is_sound=np.zeros_like(marks.is_sound)), work)
+        mend(*rest, marks._replace(is_sound=np.zeros_like(marks.is_sound)), work)
 
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -292,6 +293,21 @@ def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
         assert naive.nonmanifold(mesh.cells, result.labels) == {}
         assert result.n_nonmanifold == 0
         assert 0 < result.n_moved < 10
+
+
+@pytest.mark.parametrize("seed", [5, 77, 80])
+def test_two_cells_mend_what_one_cell_or_a_fan_does_not(seed):
+    points, cells = box(3, 60, seed)
+    rng, middle = np.random.default_rng(seed), points[cells].mean(axis=1)
+    labels = np.sin(middle @ rng.normal(size=3)) + np.sin(middle @ rng.normal(size=3) * 1.3) > 0.0
+    counts = whole(labels.astype(np.int64), 2, volumes(points, cells))
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None, None)
+    left = []
+    for has_pairs in (False, True):
+        mended = labels.astype(np.int64)
+        labelling._mend_pairs(dual, mended, np.array([[dual.size.min()] * 2, [np.inf] * 2]), has_pairs)
+        left.append(len(naive.nonmanifold(cells, mended)))
+    assert left[0] > left[1] == 0
 
 
 def test_a_label_of_one_cell_stays_and_one_without_is_lost():

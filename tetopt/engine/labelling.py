@@ -196,7 +196,7 @@ def unpinched(
     nowhere = _no_contacts(len(cells), counts.shape[1])
     _without_unfit(dual, labels, np.bincount(dual.row, dual.volume, counts.shape[1]).astype(np.float64))
     for each in (dual.contacts, nowhere):  # false contact may forbid all moves that are left
-        _mend_pairs(dual._replace(contacts=each), labels, bounds)
+        _mend_pairs(dual._replace(contacts=each), labels, bounds, has_pairs=True)
     return labels
 
 
@@ -688,7 +688,7 @@ def _mend_near(
         marks.is_sound[faces[faces >= 0]] = False
         marks.is_due[marks.is_near] = False  # all places at these nodes are tried
         marks.is_near[:] = False
-        _mend(dual, labels, room, is_bridge, faces, marks, _work(dual))
+        _mend(dual, labels, room, is_bridge, faces, False, marks, _work(dual))
 
 
 def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -697,13 +697,13 @@ def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) ->
     return np.stack([volume - bounds[0], bounds[1] - volume])
 
 
-def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> None:
-    """Mend the remaining places between two labels, even if that removes a bridge."""
+def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64], has_pairs: bool = False) -> None:
+    """Mend the remaining places between two labels, even if that removes a bridge; `has_pairs` as of `_mend`."""
     is_bridge, marks = np.zeros(len(labels), dtype=bool), _Marks(*np.zeros((3, len(dual.scale)), dtype=bool))
     for _ in range(MENDING_ROUNDS):
         faces, is_two = _nonmanifold(dual, labels)
         before, room = labels.copy(), _room(dual, labels, bounds)
-        _mend(dual, labels, room, is_bridge, faces[is_two], marks, _work(dual))
+        _mend(dual, labels, room, is_bridge, faces[is_two], has_pairs, marks, _work(dual))
         if np.array_equal(before, labels):
             break
 
@@ -927,10 +927,12 @@ def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
 
 @entry
 def _mend(
-    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, marks: _Marks, work: _Work
-) -> None:
+    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, has_pairs: bool, marks: _Marks,
+    work: _Work,
+) -> None:  # fmt: skip
     """At each place that is not manifold, make the move that most lowers the energy including pinches.
 
+    Moves are those of a cell or of a fan and, where none lowers the energy and if `has_pairs`, of two cells.
     Nodes of changed cells are marked near, and no longer sound. Nodes are marked due whose places may be mended later:
     those with a cell that has a node of a changed one, or that a label's room kept.
     """
@@ -941,7 +943,9 @@ def _mend(
             continue
         count = _gather(dual, a, b, star)
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
-        for i in range(2 * count):
+        for i in range(2 * count + (count * count if has_pairs else 0)):
+            if i >= 2 * count and best_from >= 0:
+                break
             size = _group(dual, labels, a, b, star[:count], i, group)
             if size == 0 or is_bridge[group[:size]].any():
                 continue
@@ -973,10 +977,14 @@ def _mend(
 
 @unit
 def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group: Ints1) -> int:
-    """Cells that may change together: cell i of a star, or for larger i the fan of one label that starts there."""
+    """Cells that may change together: cell i of a star, for larger i the fan of one label that starts there, or two."""
     if i < len(star):
         group[0] = star[i]
         return 1
+    if i >= 2 * len(star):
+        j, k = i // len(star) - 2, i % len(star)
+        group[0], group[1] = star[j], star[k]
+        return 2 if j < k and labels[star[j]] == labels[star[k]] else 0
     first, count, done = star[i - len(star)], 1, 0
     group[0] = first
     while done < count:
