@@ -262,7 +262,7 @@ def test_balls(balls):
         nodes = np.unique(shared.nodes[is_between])
         off = np.abs(np.linalg.norm(balls.mesh.points[nodes] - centre, axis=1) - radius)
         assert off.mean() < 0.15
-        assert np.quantile(off, 0.95) < 0.25
+        assert np.quantile(off, 0.95) < 0.33  # a third of a voxel; nodes keep a distance from their neighbours
         assert off.max() < 0.7
         a, b, c = np.moveaxis(balls.mesh.points[shared.nodes[is_between]], 1, 0)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
