@@ -81,7 +81,7 @@ FIRST_STEP_FRACTION = 0.4  # longest first step, of the distance to the nearest 
 AXIS_STEP_FRACTION = 0.1  # of that distance: search step of a stalled node along the axes
 BLOCK_NODES = 128  # nodes in a group, at most: their data fit into the cache
 APPROACH_TRIALS = 4  # fractions of the way to a surface: all of it, a half, ...
-# of the mean of a node's edges: shorter ones are not made on the way to a surface. Without it, 97 edges, not 40, are
+# of the mean of a node's edges: shorter ones are not made on the way to a surface. Without it, 97 edges, not 49, are
 # shorter than a third of those around them (CT with 41 labels, 4,000 nodes)
 SHORTEST_FRACTION = 1.0 / 3.0
 LINE_TRIALS = 2  # energies measured along the step: a third one gains a twentieth of the search along the axes
