@@ -20,12 +20,16 @@ class InputError(ValueError):
     """
 
 
-def warn(message: str) -> None:
-    """Issue a UserWarning that names the first line outside tetopt, at whatever call depth."""
+class Remark(UserWarning):
+    """A warning of what may be as intended: callers that know that it is ignore this category."""
+
+
+def warn(message: str, category: type[UserWarning] = UserWarning) -> None:
+    """Issue a warning that names the first line outside tetopt, at whatever call depth."""
     n_inside, frame = 0, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "tetopt":
         n_inside, frame = n_inside + 1, frame.f_back
-    warnings.warn(message, stacklevel=n_inside + 1)
+    warnings.warn(message, category, stacklevel=n_inside + 1)
 
 
 def error_words(error: Exception) -> str:

@@ -25,7 +25,7 @@ from nibabel.spatialimages import HeaderDataError, SpatialImage
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError, warn
+from tetopt.errors import InputError, Remark, warn
 from tetopt.image import Image
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
@@ -161,7 +161,7 @@ def load_image(
         warn(f"{path}: {note}")
     low = image.data.min()
     if low == image.data.max():
-        warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere")
+        warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", Remark)
     return image
 
 

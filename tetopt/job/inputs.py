@@ -30,7 +30,7 @@ from tetopt.contents.content import SMOOTH_INTERFACES, Content, continuation, co
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import checked_labels
 from tetopt.contents.probabilities import resample_tissue
-from tetopt.errors import InputError
+from tetopt.errors import InputError, Remark
 from tetopt.image import Image
 from tetopt.io.images import file_shape, has_own_spacing, load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
@@ -205,7 +205,7 @@ def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
     file, volume = file_and_volume(path)
     spacing = None if spacing_mm is None or has_own_spacing(file) else parse_spacing(spacing_mm)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "(?s).* everywhere, so E_D is 0")
+        warnings.simplefilter("ignore", Remark)
         return load_image(file, volume=volume, spacing_mm=spacing)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tetopt
-from tetopt.errors import InputError, error_words
+from tetopt.errors import InputError, Remark, error_words
 from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_model
@@ -277,8 +277,8 @@ def check_early(
     check_steps(loads)
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
-    with warnings.catch_warnings():  # the final mesh may have cells of further labels
-        warnings.filterwarnings("ignore", "values by label: no cell has")
+    with warnings.catch_warnings():  # the final mesh may have cells of further labels, and larger sides
+        warnings.simplefilter("ignore", Remark)
         model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
     for request in requests:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.sampling import ranges_of
-from tetopt.errors import InputError, warn
+from tetopt.errors import InputError, Remark, warn
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.mappings import ByLabel, checked_young
 
@@ -176,7 +176,8 @@ def by_label(
     kinds, which = np.unique(labels, return_inverse=True)
     if unused := [label_words(label, names) for label in values if label not in kinds]:
         few, own = (", ".join(map(str, each[:LABELS_LISTED])) for each in (unused, kinds))
-        warn(f"values by label: no cell has label {few} ({len(unused)} of {len(values)}); the mesh has {own}")
+        text = f"values by label: no cell has label {few} ({len(unused)} of {len(values)}); the mesh has {own}"
+        warn(text, Remark)
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
     if missing and mapping.rest is None:
         raise InputError(
