@@ -1,5 +1,8 @@
 """Loads in words, and what those on facets do to nodes."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
@@ -20,7 +23,7 @@ from tetopt.model.loads import (
     parse_loads,
     spring_constants,
 )
-from tetopt.model.sets import FACE_NAMES, area_vectors, box_of, nodes_of, standard_sets
+from tetopt.model.sets import FACE_NAMES, area_vectors, box_of, nodes_of, standard_sets, with_requested
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -149,6 +152,35 @@ def test_an_organ_is_pressed_along_the_world_axis(n):
     assert [top.set_name, bottom.set_name] == list(FACE_NAMES[n][-1])[::-1]
     assert not top.numbers.any()
     np.testing.assert_allclose(bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_side_where_the_box_cuts_a_stem_is_told(n):
+    """The body's upper side is the face of the box, its lower one that of a stem, of one of many blocks: too small.
+
+    Sets of the user's may be as small as they are.
+    """
+    k = {2: 40, 3: 12}[n]
+    image = tetopt.Image(np.zeros((2 * k,) * n))
+    whole = tetopt.lattice_mesh(image, blocks=(k,) * n)
+    centres = whole.points[whole.cells].mean(axis=1) + 0.5  # blocks have 2 mm
+    is_kept = (centres[:, -1] > 4.0) | (np.floor(centres[:, :-1] / 2.0) == 4.0).all(axis=1)
+    nodes, cells = np.unique(whole.cells[is_kept], return_inverse=True)
+    mesh = tetopt.Mesh(whole.points[nodes], cells.reshape(-1, n + 1))
+    known, (low, high) = standard_sets(mesh, box_of(image)), FACE_NAMES[n][-1]
+    with pytest.warns(UserWarning, match=f'"{low}" is only {len(known.facets[low])} facet') as told:
+        parse_loads(["compress:5%"], mesh, known)
+    assert len(told) == 1
+    percent = float(re.search(", (.*) % of the area that", str(told[0].message))[1])
+    assert percent == pytest.approx(100.0 * k ** (1.0 - n), rel=0.05)  # cut cells at the stem's root show a little more
+    request = str(told[0].message).split('"')[-2]
+    wider = with_requested(mesh, known, [request], None)
+    assert len(wider.facets["base"]) > len(known.facets[low])
+    small = with_requested(mesh, known, [f"tip=point:{','.join(['8.5'] * (n - 1) + ['-0.5'])}:1.5"], None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parse_loads(["move:base:" + ",".join("1" * n), f"hold:{high}", "gravity:" + ",".join("1" * n)], mesh, wider)
+        parse_loads(["hold:tip"], mesh, small)
 
 
 def test_no_side_to_press():

@@ -14,13 +14,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, Remark, warn
 from tetopt.geometry.quadratic import curved_rule, quadratic, quadratic_facet_nodes, shape_slopes, shape_values
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
-from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
+from tetopt.model.sets import (
+    BOUNDARY_SET,
+    FACE_NAMES,
+    SIDE_DEPTH,
+    Sets,
+    area_vectors,
+    facet_triples,
+    finite_numbers,
+    nodes_of,
+)
 
 PLANE_FRACTION = 1.0 - 1e-6  # the sum of area vectors of a flat set is at least this fraction of its area
+SMALL_SIDE = 0.05  # of the area that a mesh shows to a side: a loaded side with less is reported
 MOST_COMPRESSION_PERCENT = 50.0  # more is beyond a linear step
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
 # By kind: the form of the arguments, the count of numbers (n: one per dimension), and their unit.
@@ -93,6 +103,11 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     InputError
         Invalid words or numbers; an unknown set; missing step numbers; a component of a node's displacement that is
         prescribed twice in a step; forces on facets between two cells.
+
+    Warns
+    -----
+    UserWarning
+        A loaded side is far smaller than the mesh, as where the image's box cuts off a brain's stem.
     """
     loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
     check_steps(loads)
@@ -101,6 +116,9 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
             _check_outer(load, mesh, sets)
     for step in range(1, count_of_steps(loads) + 1):
         _check_apart([load for load in in_step(loads, step) if load.kind == "displacement"], mesh, sets)
+    sides = {name for pair in FACE_NAMES[mesh.ndim] for name in pair}
+    for name in dict.fromkeys(load.set_name for load in loads if load.set_name in sides):
+        _warn_of_small(name, mesh, sets)
     return loads
 
 
@@ -259,6 +277,25 @@ def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]
         if size >= PLANE_FRACTION * float(np.sqrt((areas**2).sum(axis=1)).sum()):
             return np.asarray(total / size)
     return np.eye(mesh.ndim)[-1]
+
+
+def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
+    """Warn of a side with a small part of the area that the whole mesh shows in its direction."""
+    total = area_vectors(mesh, sets.facets[name]).sum(axis=0)
+    size = float(np.sqrt((total**2).sum()))
+    if size == 0.0 or BOUNDARY_SET not in sets.facets:
+        return
+    normal = total / size
+    share = size / float(np.maximum((area_vectors(mesh, sets.facets[BOUNDARY_SET]) * normal).sum(axis=1), 0.0).sum())
+    if share < SMALL_SIDE:
+        count, along = len(sets.facets[name]), (mesh.points * normal).sum(axis=1)
+        vectors = (mesh.points[along.argmax()], normal, [SIDE_DEPTH * np.ptp(along)])
+        plane = ":".join(",".join(f"{round(number, 3) + 0.0:g}" for number in each) for each in vectors)
+        warn(
+            f'load: set "{name}" is only {count} facet{"s" * (count > 1)}, {100.0 * share:.2g} % of the area that the mesh shows '
+            f'to that side; hold or move a larger set instead, such as that of `sets` "base=plane:{plane}"',
+            Remark,
+        )
 
 
 def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
