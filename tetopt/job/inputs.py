@@ -95,6 +95,7 @@ def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tup
 
 
 Align = Callable[[Image, Image, str], Image]
+Beside = Callable[[Path, Align], Image]
 Originals = Mapping[tuple[Path, Align], Image]
 
 
@@ -102,7 +103,7 @@ class Aligned(NamedTuple):
     """An image, and a function that reads other files and aligns them to it."""
 
     image: Image
-    beside: Callable[..., Image]
+    beside: Beside
     factors: tuple[int, ...]  # parts of the file's voxels along each axis
 
 
@@ -123,12 +124,12 @@ def image_and_others(image: Image, path: Path, part: ImagePart, originals: Origi
             ]
         image = whole if slice_ is None else part_of(whole, slice_, crop)
 
-    def beside(other: Path, aligned: Callable[..., Image], **options: bool) -> Image:
+    def beside(other: Path, aligned: Align) -> Image:
         original = originals.get((other, aligned)) or read_companion(other, part.spacing_mm)
         warn_of_other_world(path, other)
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
-        moved = aligned(original, grid, str(other), **options)
+        moved = aligned(original, grid, str(other))
         moved = divided(moved, factors) if aligned is resample_contrast else moved
         is_cropped = slice_ is None and crop is not None
         if not is_same_grid(original, grid, is_cropped=is_cropped):
@@ -275,7 +276,7 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def mask_for(
-    options: MaskedPart | SourceOptions, image: Image, beside: Callable[..., Image], loaded: MeshFile | None
+    options: MaskedPart | SourceOptions, image: Image, beside: Beside, loaded: MeshFile | None
 ) -> Image | None:
     """Read the mask of an image's voxels that count: the options', else the one that a mesh's file was built within.
 
@@ -400,7 +401,7 @@ def _warn_of_mask(loaded: MeshFile, counted: Content, part: MaskedPart) -> None:
         warn_of_other_mask(loaded.mesh, counted.own_mask)
 
 
-def _within(image: Image, part: MaskedPart, beside: Callable[..., Image], loaded: MeshFile) -> Content:
+def _within(image: Image, part: MaskedPart, beside: Beside, loaded: MeshFile) -> Content:
     """Return an image as given, and continued beyond the mask of the voxels that count for a mesh's file."""
     mask = mask_for(part, image, beside, loaded)
     beyond = None if mask is None else continuation(mask, image.spacing)

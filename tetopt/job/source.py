@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
+    Align,
+    Beside,
     Originals,
     balance_of,
     file_and_volume,
@@ -121,7 +123,8 @@ def read_source(
     paths = options.images
     finest: Originals = read_mask(options, label_names)
     if options.labels is not None:
-        finest = {**finest, (options.labels, resample_labels): read_companion(options.labels, options.spacing_mm)}
+        key = (options.labels, _align_of_labels(options, numbers))
+        finest = {**finest, key: read_companion(options.labels, options.spacing_mm)}
     image, beside, factors = image_and_others(read_image(paths[0], options), paths[0], options, finest)
     labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
     if labels is not None and is_own and numbers:
@@ -191,7 +194,7 @@ class ReadLabels(NamedTuple):
 
 
 def _labelling(
-    options: SourceOptions, image: Image, beside: Callable[..., Image], label_names: Path | None,
+    options: SourceOptions, image: Image, beside: Beside, label_names: Path | None,
     numbers: Mapping[int, int] | None,
 ) -> ReadLabels:  # fmt: skip
     """Read the labels, merged by the options, or the tissues."""
@@ -205,10 +208,18 @@ def _labelling(
         return ReadLabels(tissue_labels(tissues), table, {}, is_own)
     if options.labels is None:
         return ReadLabels(table=table)
-    is_partial = bool(options.merge or options.crop or numbers)  # labels may be left out on purpose
-    labels = beside(options.labels, resample_labels, may_miss=is_partial)
+    labels = beside(options.labels, _align_of_labels(options, numbers))
     is_own = is_alone and np.array_equal(labels.data, image.data)
     return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
+
+
+def _align_of_labels(options: SourceOptions, numbers: Mapping[int, int] | None) -> Align:
+    """Return how to resample labels: if some may be left out on purpose, without a warning of those outside."""
+    return _some_labels if options.merge or options.crop or numbers else resample_labels
+
+
+def _some_labels(labels: Image, image: Image, name: str) -> Image:
+    return resample_labels(labels, image, name, may_miss=True)
 
 
 def _merged(
