@@ -8,7 +8,7 @@ import tetopt
 from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.requirements import LABEL_REMEDY
+from tetopt.engine.requirements import LABEL_REMEDY, PIECES_REMEDY
 from tetopt.job.advice import (
     agreed,
     beyond_requirements,
@@ -127,7 +127,8 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
     assert words.startswith(
         "components of labels of 50 voxels or more without a cell: 99 voxels of label 3 at (1, 2.5,"
     )
-    assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {LABEL_REMEDY}")
+    assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {PIECES_REMEDY}")
+    assert "label_weight" not in words
     assert "no cell has label" not in said()  # named above
     small = [label_of(3)._replace(lost_components=tuple(each._replace(voxels=49) for each in lost))]
     assert told(*unmet({}, {"labels": small})) == {}

@@ -38,6 +38,7 @@ COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as man
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
+PIECES_REMEDY = "allow more nodes, so that cells are smaller than these, or merge (`merge`) or clean labels of crumbs"
 COMPONENTS_LISTED = 5  # of those without a cell
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
@@ -264,6 +265,16 @@ def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:
     return "; ".join(texts)
 
 
+def label_remedy(fits: Iterable[LabelFit]) -> str:
+    """Return what helps labels that violate the requirement.
+
+    A higher weight hardly gives small components cells, at the expense of volumes: in the MNI152 T1 with tissues and
+    5,000 nodes, weight 4 leaves 23 of 28 without a cell, and fluid with -23 instead of -20 % of its volume; 20,000
+    nodes leave 2, and -10 %.
+    """
+    return PIECES_REMEDY if any(fit.pieces for fit in fits) else LABEL_REMEDY
+
+
 def _listed(pieces: list[tuple[LostComponent, str]]) -> str:
     """List the largest components, each with words on it."""
     ranked = sorted(pieces, key=lambda piece: -piece[0].voxels)
@@ -279,7 +290,7 @@ def _violated_labels(content: Content, result: MeshingResult, owner: Callable[[]
         return {}
     fits = _label_fits(content, content.memberships, result.mesh, result.labels, owner())
     text = label_faults(fits, {fit.label: str(fit.label) for fit in fits})
-    return {"labels": f"{text}; {LABEL_REMEDY}"} if text else {}
+    return {"labels": f"{text}; {label_remedy(fits)}"} if text else {}
 
 
 def _label_fits(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.requirements import LABEL_REMEDY, LABEL_VOXELS, LabelFit, label_faults
+from tetopt.engine.requirements import LABEL_VOXELS, LabelFit, label_faults, label_remedy
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
@@ -139,7 +139,7 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
 
     if faulty := [row for row, fit in fits.items() if fit.is_faulty]:
         text = label_faults(fits.values(), words)
-        yield Problem(text, name="labels", **smaller(faulty, LABEL_REMEDY))
+        yield Problem(text, name="labels", **smaller(faulty, label_remedy(fits.values())))
     others = [row for row in labels if row not in faulty]
     if small := [words[row.label] for row in others if row.is_lost]:
         yield Problem(f"no cell has label {', '.join(small)}, of fewer than {LABEL_VOXELS} voxels in the mesh")
