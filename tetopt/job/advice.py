@@ -259,11 +259,12 @@ def has_most_empty(result: MeshingResult, n_empty: int) -> bool:
 
 
 def of_empty(
-    result: MeshingResult, n_nodes: int | None, n_empty: int, spacing: NDArray[np.float64]
+    result: MeshingResult, is_free: bool, n_empty: int, spacing: NDArray[np.float64], is_masked: bool = False
 ) -> Iterator[Problem]:
     """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm.
 
-    `n_nodes` is None if they cannot be chosen.
+    `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the domain, so that the
+    image may be of no importance.
     """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_CELLS * n_cells:
@@ -271,14 +272,13 @@ def of_empty(
     text = (
         f"{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D and take the nearest "
         "voxel's value"
-    )
+    ) + ", which is harmless unless moduli come from the image" * is_masked
     if spacing.max() >= THICK_SLICES * spacing.min():
         yield Problem(f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them")
-    elif n_nodes is None:
-        yield Problem(text)
+    elif is_free:
+        yield Problem(text, "reduce `nodes`", wants="larger")
     else:
-        fewer = float(f"{n_nodes * (1.0 - n_empty / n_cells):.2g}")
-        yield Problem(text, f"reduce `nodes` to about {fewer:.0f}", wants="larger")
+        yield Problem(text)
 
 
 def tell_label_sizes(sizes: SizesByLabel) -> None:

@@ -185,7 +185,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     is_most = has_most_empty(outcome.result, n_empty)  # else fewer nodes hardly help cells that follow labels
     is_free = mode != "start" and (is_most or task.source.labels is None)
     is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
-    empty = list(of_empty(outcome.result, n_nodes if is_free else None, n_empty, spacing))
+    empty = list(of_empty(outcome.result, is_free, n_empty, spacing, task.source.mask is not None))
     problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
         problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
