@@ -276,3 +276,5 @@ def test_the_image_before_the_mesh_or_as_an_option(organ, tmp_path, command, cap
     assert printed[0] == printed[1]
     assert exit_code(command, image, mesh, *more, "--image", image) == 2
     assert "expected MESH and one image (--image), got 3 files" in capsys.readouterr().err
+    assert exit_code(command, mesh, mesh, *more) == 2
+    assert f"{mesh}: expected an image beside {mesh}, got a mesh; give one mesh at a time" in capsys.readouterr().err

@@ -114,6 +114,13 @@ def test_commands_tell_that_the_run_of_a_mesh_violated_requirements(inputs, tmp_
     assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *COARSE, "--force") == 0
     assert exit_code("convert", mesh, tmp_path / "d.vtu") == 0
     assert "violated" not in capsys.readouterr().err
+    assert exit_code("quality", mesh, "--json", tmp_path / "q.json") == 0  # without --check, it only warns
+    for path in (mesh, tmp_path / "b.msh"):
+        assert exit_code("quality", path, "--check", "--json", tmp_path / "q.json", "--force") == 1
+        said = capsys.readouterr()
+        assert "of the image's variance is unexplained" in numbers_in(tmp_path / "q.json")["violated"]["error"]
+        assert f"requirement violated: error: {path}: when built, " in " ".join(said.err.split())
+        assert said.out.splitlines()[-1].startswith(f"requirements not met: error; {path}: ")
 
 
 def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypatch, capsys):

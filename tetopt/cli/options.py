@@ -18,6 +18,7 @@ import typer
 
 from tetopt.cli.console import OPTION_NAMES, with_hyphens
 from tetopt.errors import InputError
+from tetopt.io.meshes import MESH_SUFFIXES
 from tetopt.job.job import of_option
 from tetopt.job.options import (
     IMAGE_FILES,
@@ -85,6 +86,8 @@ def mesh_and_image(files: list[Path], image: Path | None) -> tuple[Path, Path | 
     images += [] if image is None else [image]
     if len(images) > 1:
         raise InputError(f"expected MESH and one image (`image`), got {len(images) + 1} files")
+    if images and images[0].suffix.lower() in MESH_SUFFIXES:
+        raise InputError(f"{images[0]}: expected an image beside {mesh}, got a mesh; give one mesh at a time")
     return mesh, images[0] if images else None
 
 

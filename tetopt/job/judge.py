@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -106,7 +106,14 @@ class Judgement(NamedTuple):
         if self.is_checked and self.source is None and least and smallest < least - ANGLE_ROUNDING:
             text = f"{self.path}: the smallest dihedral angle is {smallest:.2f} degrees, below {least:g}"
             problems.append(Problem(text, name="min_dihedral"))
+        if self.is_checked and self.source is None:
+            problems += self._recorded(("min_dihedral", *(name for name, _ in named)))
         return agreed([*problems, *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", []))])
+
+    def _recorded(self, measured: Collection[str]) -> list[Problem]:
+        """Return requirements that the mesh's run violated, by its file, beyond those `measured` here."""
+        recorded = {name: words for name, words in self.loaded.table("violated").items() if name not in measured}
+        return [Problem(f"{self.path}: when built, {words}", name=name) for name, words in recorded.items()]
 
 
 def judge(
