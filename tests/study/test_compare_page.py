@@ -4,6 +4,8 @@ import html
 import math
 import re
 from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,17 +13,21 @@ from browser import browser, copied, document
 from markupsafe import escape
 
 import tetopt
+from tetopt.cli import console
+from tetopt.cli.compare import compare_command
 from tetopt.fem.reference import Errors, OwnError
 from tetopt.io.text import plain
 from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
+from tetopt.study import compare_files
 from tetopt.study import compare_report as records
 from tetopt.study.compare_figures import histograms_figure, slices_figure, timing_figure
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import as_json
 from tetopt.study.compare_table import columns_of, number_text, rows_of
+from tetopt.study.options import CompareOptions
 from tetopt.study.pipelines import PIPELINES
 
 
@@ -401,3 +407,22 @@ def test_the_page_in_a_browser(whole, tmp_path, width):
 def test_it_can_be_printed(whole, tmp_path):
     browser(tmp_path / "profile", f"--print-to-pdf={tmp_path / 'a.pdf'}", whole.as_uri())
     assert (tmp_path / "a.pdf").read_bytes()[:5] == b"%PDF-"
+
+
+def test_the_table_in_the_terminal_fits_into_80_columns(tmp_path, monkeypatch, capsys, wide_lines):
+    """Headings are broken between words, and no word or number is cut."""
+    report = fake_report()
+    monkeypatch.setattr(compare_files, "compare_image", lambda *_, **__: report)
+    monkeypatch.setattr(console, "LINE_WIDTH", 80)
+    assert compare_command(SimpleNamespace(obj=["compare"]), Path("T1.nii.gz"), tmp_path, CompareOptions()) == 0
+    lines = capsys.readouterr().out.splitlines()
+    table = lines[: next(k for k, line in enumerate(lines) if line.startswith("mine: twice"))]
+    assert max(map(len, table)) <= 80
+    text = "\n".join(table)
+    assert "…" not in text
+    assert "\\" not in text
+    columns = [column for column in columns_of(report) if column.is_short]
+    heads = text[: text.index("tetopt")].split()
+    assert sorted(heads) == sorted(word for column in columns for word in column.heading.split())
+    numbers = [text for row in rows_of(report, columns) for text, _ in row.cells]
+    assert all(number in text.split() for number in numbers)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
+from rich.text import Text
 
 from tetopt.cli.console import print_line, print_table
 from tetopt.cli.options import ForceOption, ImageArgument, NumberOptions
@@ -66,7 +67,7 @@ def compare_command(
     report = compare_image(image_path, output, options, command, force=force)
     columns = [column for column in columns_of(report) if column.is_short]
     rows = rows_of(report, columns)
-    table = new_table("", *(column.heading.replace(" ", "\n") for column in columns))
+    table = new_table("", *(Text(column.heading.replace(" ", "\n")) for column in columns))
     for row in rows:
         table.add_row(escape(row.title), *([text for text, _ in row.cells] or ["failed"]))
     print_table(table)
