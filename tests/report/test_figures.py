@@ -18,6 +18,7 @@ from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import mesh_image
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
@@ -37,6 +38,7 @@ from tetopt.report.figures import (
     slice_figure,
 )
 from tetopt.report.scene import save_scenes
+from tetopt.report.tables import nodes_in_words
 from tetopt.report.thumbnail import save_thumbnail
 from tetopt.start.lattice import lattice_mesh
 
@@ -524,6 +526,9 @@ def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
     for each, is_curved in ((mesh, True), (Mesh(mesh.points, mesh.cells), False)):
         figure = label_figure(labels, each, result.labels)
         assert figure.axes[1].get_title().endswith(words) == is_curved
+        size = f"{len(each.points)} corner nodes, {node_count(each.points, each.cells, 2)} in all"
+        title = label_figure(labels, each, result.labels, order=2).axes[1].get_title()
+        assert title == f"labels of the cells, {size}{words * is_curved}"
         assert slice_figure(labels, [("a", each)]).axes[0].get_title() == f"a{words * is_curved}"
         mask = Image(labels.data == 1, labels.affine)
         (legend,) = boundary_figure(labels, mask, each).legends
@@ -616,6 +621,8 @@ def test_titles_say_how_many_nodes_and_how_good(monkeypatch, tmp_path, run):
         drawn = [len(collections(axes)[0].get_paths()) for axes in (before, after)]
         assert drawn == [len(initial.cells), len(made.mesh.cells)]
         assert len(saved[-1].axes[0].lines) == (3 if shown is image else 2)
+    save_run_figures([tmp_path / k for k in "abc"], image, initial, result, order=2)
+    assert saved[-3].axes[0].get_title() == f"lattice, {nodes_in_words(initial, 2)}"
 
 
 @pytest.mark.parametrize("name", ["a", "a.png.txt"])

@@ -171,12 +171,14 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
     image = source.drawn
     own = continued(image, source.content.continuation)
-    figures.save_run_figures(pictures[:3], own, outcome.initial, outcome.result, task.start_name, image, source.mask)
+    figures.save_run_figures(
+        pictures[:3], own, outcome.initial, outcome.result, task.start_name, image, source.mask, model.order
+    )
     of_cell = model.cell_data.get("label")
     if source.mask is not None and "boundary" in pictures[3].stem:  # none for the mask of a mesh to start from
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image
-        figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
+        figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table, model.order)
         figures.save_figure(figure, pictures[-2])
     thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table)

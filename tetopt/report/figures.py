@@ -30,6 +30,7 @@ from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
+from tetopt.report.tables import nodes_in_words
 from tetopt.system.files import check_suffix, written_whole
 
 matplotlib.use("agg")
@@ -53,16 +54,16 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 
 def save_run_figures(
     paths: Sequence[Path], image: Image, initial: Mesh, result: MeshingResult, start: str = "lattice",
-    whole: Image | None = None, mask: Image | None = None,
+    whole: Image | None = None, mask: Image | None = None, order: int = 1,
 ) -> None:  # fmt: skip
     """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
 
-    `paths` are their names, and `start` names the initial mesh. If `image` is extended beyond a mask, `whole` is the
-    image to show.
+    `paths` are their names, and `start` names the initial mesh; cells have this `order`. If `image` is extended beyond
+    a mask, `whole` is the image to show.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
-    before = f"{start}, {len(initial.points)} nodes"
+    before = f"{start}, {nodes_in_words(initial, order)}"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
     save_figure(slice_figure(image if whole is None else whole, meshes, means_of=image, mask=mask), paths[0])
@@ -156,6 +157,7 @@ def label_figure(
     of_cell: NDArray[np.int64] | None = None,
     image: Image | None = None,
     table: LabelTable = NO_TABLE,
+    order: int = 1,
 ) -> Figure:
     """Draw the labels of voxels and those of cells side by side, in the same colours and in three planes.
 
@@ -171,6 +173,8 @@ def label_figure(
         the adjacent label with fewer cells.
     table : LabelTable
         Names and colours of labels.
+    order : {1, 2}
+        Of the cells, for the number of nodes.
 
     Returns
     -------
@@ -209,7 +213,7 @@ def label_figure(
         for axes in (left, right):
             view.frame(axes)
     grid[0, 0].set_title("labels of the voxels", fontsize=11)
-    grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes{_curved_words(mesh)}", fontsize=11)
+    grid[0, 1].set_title(f"labels of the cells, {nodes_in_words(mesh, order)}{_curved_words(mesh)}", fontsize=11)
     if image is not None:
         _draw_interfaces(list(grid[:, 2]), image, mesh, of_cell, colours)
         grid[0, 2].set_title("interfaces of the cells over the image", fontsize=11)
