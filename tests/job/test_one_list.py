@@ -15,6 +15,9 @@ from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
 from tetopt.cohort.numbers import row_of
 from tetopt.cohort.state import state_of
 from tetopt.job.advice import Problem, agreed, of_layers, sentences
+from tetopt.job.events import ended_words
+from tetopt.job.options import SourceOptions
+from tetopt.job.source import read_source
 from tetopt.measure.fidelity import LabelFidelity
 
 COARSE = ["--spacing", "12", "--iterations", "0"]
@@ -111,9 +114,6 @@ def test_commands_tell_that_the_run_of_a_mesh_violated_requirements(inputs, tmp_
         capsys.readouterr()
         assert exit_code("convert", source, out, "--young", "1") == 0
         assert "the run that built this mesh violated requirements: error" in capsys.readouterr().err
-    assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *COARSE, "--force") == 0
-    assert exit_code("convert", mesh, tmp_path / "d.vtu") == 0
-    assert "violated" not in capsys.readouterr().err
     assert exit_code("quality", mesh, "--json", tmp_path / "q.json") == 0  # without --check, it only warns
     for path in (mesh, tmp_path / "b.msh"):
         assert exit_code("quality", path, "--check", "--json", tmp_path / "q.json", "--force") == 1
@@ -121,6 +121,25 @@ def test_commands_tell_that_the_run_of_a_mesh_violated_requirements(inputs, tmp_
         assert "of the image's variance is unexplained" in numbers_in(tmp_path / "q.json")["violated"]["error"]
         assert f"requirement violated: error: {path}: when built, " in " ".join(said.err.split())
         assert said.out.splitlines()[-1].startswith(f"requirements not met: error; {path}: ")
+    assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *COARSE, "--force") == 0
+    assert exit_code("convert", mesh, tmp_path / "d.vtu") == 0
+    assert "violated" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, ""),
+        ({"mask": "m.nii.gz"}, ": nodes follow the surface of the mask"),
+        ({"background": "25"}, ": nodes follow the surface of the foreground"),
+        ({"mask": "m.nii.gz", "labels": "l.nii.gz"}, ": nodes follow the interfaces of labels"),
+    ],
+)
+def test_a_run_whose_energy_rises_says_what_nodes_follow(inputs, options, words):
+    tetopt.save_image(inputs / "m.nii.gz", tetopt.Image(np.indices((24, 24, 24))[0] > 4))
+    files = {name: inputs / file if file.endswith("gz") else file for name, file in options.items()}
+    source = read_source(SourceOptions(images=[inputs / "a.nii.gz"], **files))
+    assert ended_words("risen", "the mesh", source.surface_words) == f"ended, as E no longer falls{words}"
 
 
 def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypatch, capsys):

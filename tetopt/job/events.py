@@ -71,12 +71,12 @@ def listened(listener: Listener | None) -> Iterator[None]:
         _LISTENER.reset(token)
 
 
-def ended_words(ended: str, kept: str) -> str:
-    """Return why a run ended before its last iteration, and what is kept."""
+def ended_words(ended: str, kept: str, followed: str = "") -> str:
+    """Return why a run ended before its last iteration, and what is kept; `followed` names surfaces."""
     if ended == "converged":
         return "converged: the mesh hardly changes any more"
     if ended == "risen":
-        return "ended, as E no longer falls: nodes follow the interfaces of labels"
+        return "ended, as E no longer falls" + (f": nodes follow {followed}" if followed else "")
     return f"{ENDED_WORDS[ended]}: {kept} is kept"
 
 

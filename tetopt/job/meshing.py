@@ -81,7 +81,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         _prepare(task)
         started("optimise", "optimising", options["iterations"], None if ends is None else ends - time.perf_counter())
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
-        result = watched(kept, initial, options["iterations"], ends, stop, limit)
+        result = watched(kept, initial, options["iterations"], ends, stop, limit, task.source.surface_words)
         _say_search(task, number, result)
         if job.target_error is not None or job.order == 2:  # a next run may follow
             started("start", START_WORDS)
@@ -140,9 +140,12 @@ def _prepare(task: Task) -> None:
 
 def watched(
     run: Run, initial: Mesh, iterations: int, ends: float | None, stop: Callable[[], bool],
-    limit: MemoryLimit | None = None,
+    limit: MemoryLimit | None = None, followed: str = "",
 ) -> MeshingResult:  # fmt: skip
-    """Run and report the records; end early at a time, before a limit of memory, or once `stop` returns true."""
+    """Run and report the records; end early at a time, before a limit of memory, or once `stop` returns true.
+
+    `followed` names the surfaces that nodes follow, if there are any.
+    """
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
 
     def is_stopped() -> bool:
@@ -162,7 +165,7 @@ def watched(
         result = result._replace(ended="max_gb")
     if result.ended != "iterations":
         started("optimised", "optimised")
-        words = ended_words(result.ended, "the current mesh")
+        words = ended_words(result.ended, "the current mesh", followed)
         note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result
 

@@ -71,6 +71,12 @@ class Source(NamedTuple):
         return "mask" if self.about["inputs"]["background"] is None else "foreground"
 
     @property
+    def surface_words(self) -> str:
+        """Name the surfaces that nodes follow; empty if there are none."""
+        of_mask = "" if self.mask is None else f"the surface of the {self.mask_word}"
+        return of_mask if self.labels is None else "the interfaces of labels"
+
+    @property
     def low(self) -> float:
         """The least intensity."""
         return self.content.spread.low
