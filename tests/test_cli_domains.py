@@ -159,7 +159,7 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert [each["labels"] for each in again["contacts"]] == [each["labels"] for each in first["contacts"]]
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
-    for words in ("volume, mm3", "by, %", "majority", "contact beyond 1.2 times that"):
+    for words in ("volume, mm3", "volume, ", "majority", "contact beyond 1.2 times that"):
         assert words in said
     assert ("layer, %" in said) == any((row["cells_across"] or 9.0) < 2.0 for row in again["labels"])
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said

@@ -147,8 +147,8 @@ def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
     rows[7] = rows[7]._replace(mesh_components=3)
     rows[0] = rows[0]._replace(lost_components=lost, mesh_components=5)  # the space between tissues
     assert beyond_requirements({"labels": rows, "label_names": {5: "rib"}}) == {
-        "not all labels fit": "labels: of 8, 6 with less than 0.85 or more than 1.15 times the volume of voxels: "
-        "5 (rib) (0.1), 0 (0.5), 4 (1.3), 2 (0.8), 7 (1.2) and 1 more; "
+        "not all labels fit": "labels: of 7 and label 0, 6 with less than 0.85 or more than 1.15 times the volume of "
+        "voxels: 5 (rib) (0.1), 0 (0.5), 4 (1.3), 2 (0.8), 7 (1.2) and 1 more; "
         "3 with components without a cell: "
         "1 (2 of 9, voxels: 43), 3 (1 of 2, voxels: 40), 5 (rib) (1 of 1, voxels: 3); "
         "2 with more pieces of cells than of voxels: 7 (3), 3 (2)"
@@ -178,7 +178,7 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
     ]
     (line,) = beyond_requirements({"labels": rows, "interfaces": surfaces}).values()
     assert line == (
-        "labels: of 7, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 (2 of 9, voxels: 43); "
+        "labels: of 6 and label 0, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 (2 of 9, voxels: 43); "
         "2 with fewer pieces of cells than of voxels: 3 (3 of 7), 2 (2 of 3); "
         "1 with fewer cavities in cells than in voxels: 6 (1 of 3)"
     )

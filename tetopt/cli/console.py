@@ -245,14 +245,16 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", ever
 
 def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
     """Print the labels: the worst, or every one with all measures."""
+    from tetopt.model.labels import count_of_labels
     from tetopt.report.tables import label_differences, label_table, surface_table, worst_labels
 
-    names, n_labels = measured.get("label_names", {}), len(measured["labels"])
+    names = measured.get("label_names", {})
     places = worst_labels(measured["labels"], *([None] if every else []))
     rows, interfaces = ([measured[name][place] for place in places] for name in ("labels", "interfaces"))
     print_table(label_table(rows, names, ndim))
-    if len(places) < n_labels:
-        which = f"the {len(places)} of {n_labels} labels that fit worst, by Dice or volume"
+    if len(places) < len(measured["labels"]):
+        n_all = count_of_labels([row.label for row in measured["labels"]], " labels")
+        which = f"the {len(places)} of {n_all} that fit worst, by Dice or volume"
         print_line(f"{which}; `tetopt quality --all` prints all")
     if every:
         print_table(surface_table(rows, interfaces, names))

@@ -18,7 +18,7 @@ from tetopt.job.inputs import listed
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
-from tetopt.model.labels import label_words
+from tetopt.model.labels import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
@@ -175,8 +175,9 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
         for what, rank, words in faults:
             if row.label != BACKGROUND_LABEL or "volume" in what:
                 of_labels.setdefault(what, []).append((rank, f"{label_words(row.label, names)} ({words})"))
+    n_all = count_of_labels([row.label for row in rows])
     texts = [f"{len(some)} {what}: {listed([each for _, each in sorted(some)], 5)}" for what, some in of_labels.items()]
-    return beyond | ({"not all labels fit": f"labels: of {len(rows)}, {'; '.join(texts)}"} if texts else {})
+    return beyond | ({"not all labels fit": f"labels: of {n_all}, {'; '.join(texts)}"} if texts else {})
 
 
 def _faults(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.labels import colours_by_number, hex_colour
+from tetopt.contents.labels import BACKGROUND_LABEL, colours_by_number, hex_colour
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
 
@@ -40,6 +40,17 @@ class LabelTable(NamedTuple):
 
 
 NO_TABLE = LabelTable({}, {})  # for labels that only have numbers
+
+
+def count_of_labels(labels: Collection[int], noun: str = "") -> str:
+    """Count labels, and name label 0 beside them, which is no tissue.
+
+    Examples
+    --------
+    >>> count_of_labels([0, 3, 7], " labels")
+    '2 labels and label 0'
+    """
+    return f"{len(labels) - (BACKGROUND_LABEL in labels)}{noun}" + " and label 0" * (BACKGROUND_LABEL in labels)
 
 
 def label_words(label: int, names: Mapping[int, str]) -> str:

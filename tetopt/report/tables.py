@@ -154,11 +154,11 @@ def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS)
 def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: int) -> Table:
     """Return a table of how well a mesh represents labels.
 
-    Each label has a row, with its name if any. "larger by" compares its cells with its voxels; the distance is that of
-    their surfaces, and parts are connected components.
+    Each label has a row, with its name if any. "volume, %" is by how much its cells are larger than its voxels; the
+    distance is that of their surfaces, and parts are connected components.
     """
     table = _table_of_labels(
-        "voxels", size_words(ndim).replace(" ", "\n"), "cells", "larger\nby, %", "Dice", "distance\n95 %, mm",
+        "voxels", size_words(ndim).replace(" ", "\n"), "cells", "volume,\n%", "Dice", "distance\n95 %, mm",
         "parts of\nvoxels", "of\ncells",
     )  # fmt: skip
     for row in rows:
