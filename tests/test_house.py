@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = sorted((ROOT / "tetopt").rglob("*.py"))
+SOURCES = sorted(path for path in (ROOT / "tetopt").rglob("*.py") if "__pycache__" not in path.parts)
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
 # More than 8 parameters: public functions, whose signature is a contract.
 WIDE = {
