@@ -17,7 +17,7 @@ from tetopt.job.options import DEFAULT_NODES, Option, has_model
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
-from tetopt.report.tables import STRAIGHT_WORDS, add_quality, new_table, nodes_in_words
+from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.system.files import results_folder
 
 
@@ -63,8 +63,7 @@ def _print_comparison(result: Result, n_empty: int) -> None:
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     first_shape, last_shape = result.shapes
     if first_shape is not None and last_shape is not None:
-        add_quality(table, first_shape, last_shape, in_all=in_all)
-    table.caption = None if result.mesh.midpoints is None else STRAIGHT_WORDS
+        add_quality(table, first_shape, last_shape, in_all=in_all, is_curved=result.mesh.midpoints is not None)
     if n_empty:
         table.add_row("cells without a voxel centre", "", str(n_empty))
     print_table(table)

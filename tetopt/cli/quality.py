@@ -14,7 +14,7 @@ from tetopt.job.judge import Judgement, judge
 from tetopt.job.options import LabelNamesOption, MaskedPart, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit
-from tetopt.report.tables import STRAIGHT_WORDS, add_quality, new_table, nodes_in_words
+from tetopt.report.tables import add_quality, new_table, nodes_in_words
 
 
 def quality_command(
@@ -44,8 +44,8 @@ def quality_command(
     table = new_table("", escape(mesh.name))
     in_all = [size["n_nodes_in_all"]] if judgement.loaded.order == 2 else []
     jacobian = judgement.numbers.get("min_scaled_jacobian")
-    add_quality(table, judgement.shape, in_all=in_all, jacobian=jacobian, every=every)
-    table.caption = None if jacobian is None else STRAIGHT_WORDS
+    is_curved = judgement.loaded.mesh.midpoints is not None
+    add_quality(table, judgement.shape, in_all=in_all, jacobian=jacobian, every=every, is_curved=is_curved)
     if source is not None and judgement.fit is not None:
         _add_fit(table, judgement.fit, source, judgement.left_out, every)
     print_table(table)

@@ -65,11 +65,13 @@ def nodes_in_words(mesh: Mesh, order: int) -> str:
 
 
 def add_quality(
-    table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None, every: bool = False
-) -> None:
+    table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None, every: bool = False,
+    is_curved: bool = False,
+) -> None:  # fmt: skip
     """Add rows on the shape of one or more meshes, one column each; `in_all` are the numbers of nodes of quadratic
     meshes, `jacobian` is the smallest scaled Jacobian determinant of curved cells. `every` adds all measures of rho and
-    the kinds of bad cells."""
+    the kinds of bad cells; `is_curved` a caption on what is measured of curved cells."""
+    table.caption = STRAIGHT_WORDS if is_curved else None
     nodes = [str(q.n_nodes) for q in meshes]
     nodes = [f"{whole} ({own} corners)" for whole, own in zip(in_all, nodes, strict=True)] if in_all else nodes
     table.add_row("nodes", *nodes)
