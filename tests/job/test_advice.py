@@ -294,7 +294,7 @@ def test_nodes_that_do_not_suffice_are_called_the_least(said):
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
     told(*of_empty(ended(), True, 1, np.ones(3), is_masked=True))
-    assert "nearest voxel's value, which is harmless unless moduli come from the image; reduce" in said()
+    assert "nearest voxel's value, which is harmless unless moduli come from the image\n" in said()
     for slices, words in ((1.5, "; reduce `nodes`"), (5.5, "slices are 5.5 mm apart")):
         told(*of_empty(ended(), True, 1, np.array([1.0, 1.0, slices])))
         text = said()

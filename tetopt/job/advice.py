@@ -264,8 +264,8 @@ def of_empty(
 ) -> Iterator[Problem]:
     """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm.
 
-    `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the domain, so that the
-    image may be of no importance.
+    `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the domain: the image may be
+    of no importance, and fewer nodes are no remedy.
     """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_CELLS * n_cells:
@@ -276,7 +276,7 @@ def of_empty(
     ) + ", which is harmless unless moduli come from the image" * is_masked
     if spacing.max() >= THICK_SLICES * spacing.min():
         yield Problem(f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them")
-    elif is_free:
+    elif is_free and not is_masked:
         yield Problem(text, "reduce `nodes`", wants="larger")
     else:
         yield Problem(text)
