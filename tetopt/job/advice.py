@@ -264,8 +264,8 @@ def of_empty(
 ) -> Iterator[Problem]:
     """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the voxels, mm.
 
-    `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the domain: the image may be
-    of no importance, and fewer nodes are no remedy.
+    `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the domain, so that the
+    image may be of no importance, and fewer nodes are no remedy.
     """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_CELLS * n_cells:
