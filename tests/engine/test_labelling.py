@@ -13,7 +13,15 @@ import tetopt
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine import labelling
 from tetopt.engine.complex import fill_across
-from tetopt.engine.labelling import component_sizes, components_of, keeps_topology, labelled
+from tetopt.engine.labelling import (
+    Contents,
+    components_of,
+    keeps_topology,
+    label_voxels,
+    labelled,
+    unfit_labels,
+    unpinched,
+)
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import stars
 
@@ -44,11 +52,11 @@ def solved(points, cells, labels, n_labels=2, components=None, weight=None, coun
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
     components = [np.array([1])] * n_labels if components is None else components
     across = across_of(cells, len(points))
-    labels = labelled(points, cells, across, counts, components, None, False, weight=weight)
+    labels = labelled(points, cells, across, Contents(counts), components, False, weight)
     return Labelling(
         labels,
         int((labels != counts.toarray().argmax(axis=1)).sum()),
-        int(labelling._nonmanifold(labelling._dual(points, cells, across, counts, None, weight), labels)[1].sum()),
+        int(labelling._nonmanifold(labelling._dual(points, cells, across, Contents(counts), weight), labels)[1].sum()),
         np.bincount(components_of(across, labels)[1], minlength=n_labels).tolist(),
         np.setdiff1d(counts.indices[counts.data > 0.0], labels).tolist(),
     )
@@ -106,7 +114,7 @@ def test_what_is_not_manifold_as_the_twin(n):
         points, cells = box(n, 20, seed) if seed else lattice(n, 2)
         labels = rng.integers(0, 2 + seed, len(cells))
         counts = whole(labels, 4, volumes(points, cells))
-        dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None, None)
+        dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(counts), None)
         faces, is_two = labelling._nonmanifold(dual, labels)
         bad = {frozenset(int(i) for i in face if i >= 0): two for face, two in zip(faces, is_two, strict=True)}
         assert bad == {face: len(there) == 2 for face, there in naive.nonmanifold(cells, labels).items()}
@@ -120,7 +128,7 @@ def test_moves_lower_the_energy(n):
     rng = np.random.default_rng(5)
     points, cells = box(n, 40, 1)
     voxels = rng.random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), None, 0.2)
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.2)
     labels = voxels.argmax(axis=1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
 
@@ -168,7 +176,7 @@ def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
     points, cells = box(3, 8, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), None, 0.1)
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
     labels = voxels.argmax(axis=1)
     number, of_component = components_of(dual.across, labels)
@@ -300,14 +308,42 @@ def test_two_cells_mend_what_one_cell_or_a_fan_does_not(seed):
     points, cells = box(3, 60, seed)
     rng, middle = np.random.default_rng(seed), points[cells].mean(axis=1)
     labels = np.sin(middle @ rng.normal(size=3)) + np.sin(middle @ rng.normal(size=3) * 1.3) > 0.0
-    counts = whole(labels.astype(np.int64), 2, volumes(points, cells))
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None, None)
-    left = []
-    for has_pairs in (False, True):
-        mended = labels.astype(np.int64)
-        labelling._mend_pairs(dual, mended, np.array([[dual.size.min()] * 2, [np.inf] * 2]), has_pairs)
-        left.append(len(naive.nonmanifold(cells, mended)))
-    assert left[0] > left[1] == 0
+    labels, across = labels.astype(np.int64), across_of(cells, len(points))
+    contents = Contents(whole(labels, 2, volumes(points, cells)))
+    by_one, dual = labels.copy(), labelling._dual(points, cells, across, contents, None)
+    labelling._mend_pairs(dual, by_one, np.array([[dual.size.min()] * 2, [np.inf] * 2]), labels < 0)
+    by_two = unpinched(points, cells, across, contents, labels, np.full(2, volumes(points, cells).sum()))
+    assert len(naive.nonmanifold(cells, by_one)) > len(naive.nonmanifold(cells, by_two)) == 0
+
+
+@pytest.mark.parametrize(("share", "n_voxels", "is_kept"), [(0.35, 1.0, True), (0.25, 1.0, False), (0.35, 0.6, False)])
+def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept):
+    """One that fills a third of a cell, but not one that fills a quarter, or is far smaller than the cell."""
+    points, cells = lattice(3, 5)
+    size, labels = volumes(points, cells), (points[cells].mean(axis=1)[:, 0] < 1.5).astype(np.int64)
+    full = whole(labels, 2, size).toarray()
+    piece = np.argmin(np.abs(points[cells].mean(axis=1) - 3.0).max(axis=1))
+    full[piece] = size[piece] * np.array([1.0 - share, share])
+    held = np.append(share, np.full(4, (n_voxels - share) / 4)) * size[piece]
+    pieces = csr_array((held, (np.zeros(5, dtype=int), piece - np.arange(5))), (1, len(cells)))
+    contents = Contents(csr_array(full), None, pieces, np.array([1]))
+    made = labelled(points, cells, across_of(cells, len(points)), contents, [np.array([1])] * 2, weight=1e-9)
+    assert (made[piece] == 1) == is_kept
+    assert (made != labels).sum() == is_kept
+    assert naive.nonmanifold(cells, made) == {}
+
+
+@pytest.mark.parametrize(("aim", "is_kept"), [(3.2, True), (3.5, False), (1e9, False)])
+def test_a_label_with_next_to_nothing_of_its_volume_goes_from_finished_cells(aim, is_kept):
+    """By its volume `aim` over that of its only cell, which is far smaller than a mean cell."""
+    points, cells = box(3, 60, 1)
+    size, labels = volumes(points, cells), np.zeros(len(cells), dtype=np.int64)
+    labels[np.argmin(size)] = 1
+    assert size.min() < 0.1 * size.mean()
+    volume = np.array([size.sum(), aim * size.min()])
+    made = unpinched(points, cells, across_of(cells, len(points)), Contents(whole(labels, 2, size)), labels, volume)
+    assert (made == labels).all() == is_kept
+    assert unfit_labels(labels, size, volume).tolist() == [False, not is_kept]
 
 
 def test_a_label_of_one_cell_stays_and_one_without_is_lost():
@@ -333,5 +369,17 @@ def test_no_label_goes_for_a_bridge():
 
 def test_components_of_voxels():
     partition = np.array([[0, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 3]])
-    sizes = component_sizes(partition, 4)
+    sizes = label_voxels(partition, np.ones(2), 4).components
     assert [s.tolist() for s in sizes] == [[5], [3, 3], [], [1]]
+
+
+def test_pieces_of_labels_are_large_components_but_the_largest():
+    """Of 64, 50, 49 and 75 voxels of one label: those of 64 and 50. One component of another label is none."""
+    partition = np.zeros((12, 12, 12), dtype=np.int64)
+    partition[:4, :4, :4] = partition[5:10, 5:10, 5:7] = partition[:3, :5, 6:11] = partition[11, :7, :7] = 1
+    partition[:, 11] = 2
+    pieces = label_voxels(partition, np.ones(3), 3).pieces
+    number = np.arange(partition.size).reshape(partition.shape)
+    assert pieces.label.tolist() == [1, 1]
+    for k, box in enumerate((np.s_[:4, :4, :4], np.s_[5:10, 5:10, 5:7])):
+        assert pieces.voxels[pieces.piece == k].tolist() == number[box].ravel().tolist()

@@ -11,7 +11,7 @@ import tetopt
 from tetopt.contents.memberships import labels_at, memberships
 from tetopt.engine.fast import BAND_FRACTION, MOST_OFFSET_FRACTION, Run
 from tetopt.engine.interfaces import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
-from tetopt.engine.labelling import label_voxels, labelled
+from tetopt.engine.labelling import Contents, label_voxels, labelled
 from tetopt.engine.surface import fill_offsets
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.interfaces import label_interfaces
@@ -75,7 +75,7 @@ def test_small_cells_are_filled_by_levels_not_by_centres():
     image = tetopt.Image((np.indices((8, 8, 8))[0] >= 4).astype(float) + 1.0)
     mesh = tetopt.lattice_mesh(image, spacing=1.6)
     members = memberships(image)
-    counts, _ = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2))
+    counts = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2)).counts
     size = volumes(mesh.points, mesh.cells)
     assert counts.sum(axis=1) == pytest.approx(size)
     places = PART_CENTRES[3] @ mesh.points[mesh.cells]
@@ -92,7 +92,8 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
     image = tetopt.Image(data)
     mesh, members = tetopt.lattice_mesh(image, spacing=spacing), memberships(image)
     voxels = label_voxels(members.partition, image.spacing, 4)
-    counts, contacts = cell_contents(image, members, mesh, voxels)
+    contents = cell_contents(image, members, mesh, voxels)
+    counts = contents.counts
     owner, aim = tetopt.cell_of_voxel(image, mesh), np.zeros(counts.shape)
     is_few = np.bincount(owner.ravel(), minlength=len(aim)) < FEWEST_CENTRES
     there = labels_at(members, image.to_index(mesh.points), mesh.cells, PART_CENTRES[3])
@@ -108,7 +109,7 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
     assert is_few.all() == (spacing < 2.0)
     assert counts.has_sorted_indices
     assert counts.toarray() == pytest.approx(aim, abs=1e-12)
-    assert contacts.is_place.sum() == len(np.unique(owner.ravel()[voxels.places]))
+    assert contents.contacts.is_place.sum() == len(np.unique(owner.ravel()[voxels.places]))
 
 
 def slab(n, cubes):
@@ -125,8 +126,8 @@ def test_a_thin_label_keeps_its_volume(n):
     """A label that fills a third of the cells of a slab gets a third of these, or none without a bias."""
     points, cells, across, size, share = slab(n, 4)
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
-    kept = labelled(points, cells, across, counts, NO_COMPONENTS[:2], weight=1e-3)
-    lost = labelled(points, cells, across, counts, NO_COMPONENTS[:2], keeps_volumes=False, weight=1e-3)
+    kept = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], weight=1e-3)
+    lost = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], keeps_volumes=False, weight=1e-3)
     aim = (share * size).sum()
     assert size[kept == 1].sum() == pytest.approx(aim, rel=0.35)
     assert (lost == 1).sum() <= 1
@@ -138,7 +139,7 @@ def test_a_slab_thinner_than_cells_keeps_its_volume(fullest):
     points, cells, across, size, share = slab(3, 6)
     share *= fullest / share.max()
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
-    made = labelled(points, cells, across, counts, NO_COMPONENTS[:2], weight=1e-3)
+    made = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], weight=1e-3)
     assert size[made == 1].sum() / (share * size).sum() == pytest.approx(1.0, abs=0.2)
 
 

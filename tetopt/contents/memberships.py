@@ -149,24 +149,30 @@ def _agree(members: Memberships) -> None:
             steps = list(threads.map(lambda row: _missing_depth(members, row, boxes[row], nears[row]), due))
             due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
             for row, step in zip(due, filter(None, steps), strict=True):
-                level, is_near = members.levels[members.channel[row]][boxes[row]], nears[row]
+                level = members.levels[members.channel[row]][boxes[row]]
+                is_near = _mask_of(nears[row], level.shape)
                 is_own = partition[boxes[row]][is_near] == row
                 moved = level[is_near] - np.float32(AGREEMENT_STEP * step)
                 least, most = np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0])
                 level[is_near] = np.where(is_own, least, most)
 
 
-def _near(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Voxels so near to a label that no other label of its channel has its level there."""
-    return scipy.ndimage.maximum_filter(inside, 2 * AGREEMENT_REACH + 1)
+def _near(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Voxels so near to a label that no other label of its channel has its level there, as bits: boxes overlap."""
+    return np.packbits(scipy.ndimage.maximum_filter(inside, 2 * AGREEMENT_REACH + 1))
 
 
-def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], is_near: NDArray[np.bool_]) -> float:
+def _mask_of(bits: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    return np.unpackbits(bits, count=prod(shape)).view(np.bool_).reshape(shape)
+
+
+def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], near: NDArray[np.uint8]) -> float:
     """Volume that a label lacks between labels, over its area, voxels; 0 if that is next to nothing of its volume.
 
     Sampled at places in voxels near the label, quasi-random (Roberts' sequence R3), as regular ones would miss layers.
     """
-    inside, place = members.partition[box] == row, np.flatnonzero(is_near)
+    inside = members.partition[box] == row
+    place = np.flatnonzero(_mask_of(near, inside.shape))
     place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)]
     is_own, n = inside.ravel()[place], inside.ndim
     at = np.stack(np.unravel_index(place, inside.shape), axis=1) + [side.start for side in box]

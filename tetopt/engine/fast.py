@@ -252,7 +252,7 @@ def followed(
         fall = np.inf if is_new else 1.0 - run.E() / E if E > 0.0 else 0.0
         # 3. Exchange nodes: in every second of the first iterations.
         if nodes is not None and does_exchange and not is_over():
-            n_changes += run.exchange_towards(nodes, course.sizes)
+            n_changes += run.exchange_towards(nodes, course.sizes, is_over)
         # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts do so in
         # every round, as nodes of flat cells may be fixed in the next one.
         is_finished = is_finished and (iteration == course.last or not is_over())
@@ -390,13 +390,15 @@ class Run:
         since[moved] = self.state.complex.ticks[moved]
         return moved
 
-    def exchange_towards(self, nodes: int, sizes: Sizes) -> int:
+    def exchange_towards(self, nodes: int, sizes: Sizes, is_over: Callable[[], bool]) -> int:
         """Exchange nodes once, or repeatedly towards targets while the number is far off; return the number of changes.
 
         Targets can be reached from any mesh, even one with a tenth of the nodes; moving nodes first would be futile.
         """
         n_changes = n_last = self.exchange(nodes, sizes)
         while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_FRACTION * nodes:
+            if is_over():
+                break
             n_last = self.exchange(nodes, sizes)
             n_changes += n_last
         return n_changes

@@ -17,7 +17,7 @@ from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, node_stars
-from tetopt.engine.labelling import Contacts, LabelVoxels, label_voxels, labelled, unfit_labels, unpinched
+from tetopt.engine.labelling import Contacts, Contents, LabelVoxels, label_voxels, labelled, unfit_labels, unpinched
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
@@ -43,9 +43,9 @@ def with_labels(
     voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels))
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
-    counts, contacts = cell_contents(image, members, mesh, voxels)
+    contents = cell_contents(image, members, mesh, voxels)
     state.complex.labels[:n_cells] = labelled(
-        mesh.points, mesh.cells, across, counts, voxels.components, contacts, keeps_volumes
+        mesh.points, mesh.cells, across, contents, voxels.components, keeps_volumes
     )
     step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
@@ -61,24 +61,22 @@ def with_labels(
 
 
 def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> None:
-    """Give cells other labels where an interface of two labels is no manifold, or a label's cells are next to nothing.
+    """Give cells other labels where an interface of two labels is no manifold, or cells are next to nothing of theirs.
 
     No node moves.
     """
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     aim = image.voxel_volume * np.array([sizes.sum() for sizes in voxels.components])
-    is_unfit = unfit_labels(labels, np.abs(volumes(mesh.points, mesh.cells)), aim)
+    is_unfit = unfit_labels(labels, mesh.cell_volumes, aim)
     if is_unfit.any() or any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
-        counts, contacts = cell_contents(image, members, mesh, voxels)
-        labels[:] = unpinched(mesh.points, mesh.cells, across, counts, contacts, labels)
+        contents = cell_contents(image, members, mesh, voxels)
+        labels[:] = unpinched(mesh.points, mesh.cells, across, contents, labels, aim)
         _meet_everywhere(state, node_stars(state))
 
 
-def cell_contents(
-    image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels
-) -> tuple[scipy.sparse.csr_array, Contacts]:
-    """Voxels of each label in each cell, (M, K), and contacts of labels; cells with few centres are sampled.
+def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> Contents:
+    """Voxels of each label in each cell, contacts of labels, and their pieces; cells with few centres are sampled.
 
     A cell of a thin sheet may contain one centre, or none. Levels are sampled at the centres of equal parts.
     """
@@ -112,7 +110,10 @@ def cell_contents(
         counts = counts + scipy.sparse.csr_array((np.ones(len(centre)), at), shape=counts.shape)
     is_place = np.zeros(n_cells + 1, dtype=bool)
     is_place[owner[voxels.places]] = True
-    return counts, Contacts(voxels.is_apart, is_place[:-1].copy())
+    pieces, holder = voxels.pieces, owner[voxels.pieces.voxels]
+    piece, cell = pieces.piece[holder >= 0], holder[holder >= 0]
+    in_cells = scipy.sparse.csr_array((np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), n_cells))
+    return Contents(counts, Contacts(voxels.is_apart, is_place[:-1].copy()), in_cells, pieces.label)
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from tetopt.contents.labels import BACKGROUND_LABEL, LostComponent, voxel_compon
 from tetopt.contents.memberships import Memberships, supersampling
 from tetopt.energy.discretization import unexplained
 from tetopt.energy.sampling import cell_of_voxel
+from tetopt.engine.labelling import COMPONENT_VOXELS
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
@@ -34,7 +35,6 @@ from tetopt.mesh import Mesh
 OF_VOXELS = ("mask", "components", "labels")  # requirements on the voxels in cells, which curved edges change
 MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
-COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many voxels must have a cell
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
