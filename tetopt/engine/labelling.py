@@ -142,6 +142,7 @@ def labelled(
     keeps_volumes : bool
         Give a bonus to labels that lack volume: a label that is thinner than cells has most of the voxels in few of
         them. The bonus is in proportion to the loss, so that the overlap that it costs is bounded (`MOST_BIAS`).
+        Large components of voxels keep a cell, too.
     weight : float, optional
         Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
 
@@ -158,7 +159,9 @@ def labelled(
         _balance(dual, aim, bounds[0])
     labels = _given(dual, aim, bounds, voxel, components)
     _without_unfit(dual, labels, aim)
-    is_kept = _keep_pieces(dual, labels, contents, voxel)
+    is_kept = np.zeros(len(labels), dtype=bool)
+    if keeps_volumes:
+        _keep_pieces(dual, labels, is_kept, contents, voxel)
     for each in LAST_FRACTIONS:
         _mend_pairs(dual, labels, np.multiply.outer(each, aim), is_kept)
     return labels
@@ -248,13 +251,14 @@ def _keep_each(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) 
             labels[best] = label
 
 
-def _keep_pieces(dual: Dual, labels: NDArray[np.int64], contents: Contents, voxel: float) -> NDArray[np.bool_]:
+def _keep_pieces(
+    dual: Dual, labels: NDArray[np.int64], is_kept: NDArray[np.bool_], contents: Contents, voxel: float
+) -> None:
     """Give each piece without a cell of its label the cell that it fits best, if one does; `voxel` in mm^n.
 
-    Cells with which interfaces remain manifold go first. Returns a mask of the cells, (M,), as mending would give most
-    others away again.
+    Cells with which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,), as mending would
+    give most others away again.
     """
-    is_kept = np.zeros(len(labels), dtype=bool)
     n_of, pieces = np.bincount(labels, minlength=len(dual.bias)), contents.pieces
     for piece, label in enumerate(contents.label_of_piece):
         own = slice(pieces.indptr[piece], pieces.indptr[piece + 1])
@@ -267,7 +271,6 @@ def _keep_pieces(dual: Dual, labels: NDArray[np.int64], contents: Contents, voxe
         best = next((cell for cell in fit if _is_manifold(dual, labels, cell, label)), fit[0])
         n_of[[labels[best], label]] += -1, 1
         labels[best], is_kept[best] = label, True
-    return is_kept
 
 
 def _is_manifold(dual: Dual, labels: NDArray[np.int64], cell: int, label: int) -> bool:
