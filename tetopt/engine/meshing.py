@@ -34,7 +34,6 @@ from tetopt.engine.loop import (
     Boundary,
     MeshingResult,
 )
-from tetopt.engine.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, meshing_bytes
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.requirements import checked_curved, requested, unexplained_by
 from tetopt.errors import InputError
@@ -44,7 +43,8 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
-from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
+from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, meshing_bytes
+from tetopt.start.octree import is_near, nearest_octree, nodes_for_walls, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import at_most, check_memory
 
@@ -277,6 +277,8 @@ class MeshSearch:
         content, aim = self._content, self._aim
         is_filled = aim.mode != "start" and content.region is None
         result = requested(result, content, aim.target_error, is_filled)
+        if aim.mode == "graded" and aim.order == 1 and aim.nodes is not None and result.ended not in CUT_SHORT:
+            result = _with_nodes_for_walls(result, content, aim.nodes, aim.sizes)
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
             result = checked_curved(result._replace(mesh=mesh, curving=curving), content)
@@ -303,6 +305,19 @@ def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
     return lattice_within(content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing)
 
 
+def _with_nodes_for_walls(result: MeshingResult, content: Content, nodes: int, sizes: Sizes | None) -> MeshingResult:
+    """Add the number of nodes that would keep a mask's walls to violated requirements, if the initial mesh lost some.
+
+    Both requirements end in the advice to allow more nodes.
+    """
+    names = {"mask", "components"} & set(result.violated)
+    enough = nodes_for_walls(content, result.initial, nodes, sizes) if names else None
+    if enough is None:
+        return result
+    more = {name: f"{result.violated[name]}, about {enough}" for name in names}
+    return result._replace(violated={**result.violated, **more})
+
+
 def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
     """The remaining `max_seconds` for a run, if time is limited, out of that for all runs and initial meshes."""
     if options.get("max_seconds") is None:
@@ -316,7 +331,7 @@ def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) ->
 
 
 def bytes_of(content: Content, nodes: int) -> float:
-    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.engine.memory.meshing_bytes`."""
+    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.start.memory.meshing_bytes`."""
     image = content.image
     return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
 

@@ -27,9 +27,10 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
+from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.geometry.topology import components
-from tetopt.image import Image
+from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
 OF_VOXELS = ("mask", "components", "labels")  # requirements on the voxels in cells, which curved edges change
@@ -71,7 +72,7 @@ def checked(
         farther beyond the image's box than the initial mesh's. `cover`: voxels or volume lost or gained relative to the
         initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
         two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask, or
-        components of the mask of 50 voxels or more without a cell.
+        components of the mask, or parts far from any cell, of 50 voxels or more without a cell.
         `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
         manifold. `labels`: labels of 200 voxels or more none of which lies in a cell
         with that label, or whose cells have less than 0.6 or more than 1.5 times their volume, and components of labels
@@ -208,7 +209,25 @@ def _violated_components(content: Content, region: Region, mesh: Mesh, owner: ND
         texts.append(f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells")
     large = [(each, "") for each in lost if each.voxels >= COMPONENT_VOXELS]
     texts += [f"components of the mask {LARGE_COMPONENTS} without a cell: {_listed(large)}"] if large else []
+    bare = _bare_parts(mesh, region.inside[planes] & (owner[planes] < 0), affine)
+    bare = [(each, "") for each in bare if each.voxels >= COMPONENT_VOXELS and each not in lost]
+    texts += [f"parts of the mask {LARGE_COMPONENTS} with no cell near: {_listed(bare)}"] if bare and not large else []
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
+
+
+def _bare_parts(
+    mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]
+) -> tuple[LostComponent, ...]:  # fmt: skip
+    """Components of a mask's voxels without a cell that lie farther from the nearest node than its longest edge."""
+    ends = edge_ends(mesh.cells).reshape(-1, 2)
+    length = np.linalg.norm(np.diff(mesh.points[ends], axis=1)[:, 0], axis=1)
+    longest = np.zeros(len(mesh.points))
+    np.maximum.at(longest, ends, length[:, None])
+    index = np.argwhere(is_bare)
+    distance, node = scipy.spatial.cKDTree(mesh.points).query(transformed(index, affine[:-1, :-1]) + affine[:-1, -1])
+    is_far = np.zeros_like(is_bare)
+    is_far[tuple(index[distance > longest[node]].T)] = True
+    return voxel_components(is_far, np.zeros_like(is_far), affine)[1]
 
 
 def _violated_manifold(content: Content, result: MeshingResult) -> dict[str, str]:

@@ -20,6 +20,7 @@ from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.model.labels import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
+from tetopt.start.octree import is_for_walls
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
 # Of the cells, over the voxels': other volumes are told beside the verdict.
@@ -104,7 +105,7 @@ def unmet(requirements: Mapping[str, str], measured: dict[str, Any], word: str =
     yield from of_labels
     yield from _of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
-        text = f"dropped {n_dropped} connected components of the mesh that the {word} does not have"
+        text = f"dropped {n_dropped} small connected components of the mesh that are not separate in the {word}"
         yield Problem(f"{text}{_dropped_words(measured)}", "`keep_components` keeps them")
 
 
@@ -228,7 +229,10 @@ def of_result(
     The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
+        n_initial = len(result.initial.points)
+        for_walls = mode == "graded" and "mask" in measured and n_nodes > nodes and is_for_walls(n_initial, nodes)
         text = f"{n_nodes} nodes instead of {nodes}"
+        text += f" (the initial mesh has {n_initial}, to keep thin walls of the mask)" if for_walls else ""
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
             remedy = "set `nodes` to that, or use larger sizes"
             yield Problem(f"{text}: the target sizes need about {needed}", remedy, wants="smaller")

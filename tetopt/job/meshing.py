@@ -15,7 +15,6 @@ from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.memory import next_bytes
 from tetopt.engine.meshing import (
     ERROR_REACHED,
     ERROR_RUNS,
@@ -40,6 +39,8 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
+from tetopt.start.memory import next_bytes
+from tetopt.start.octree import is_for_walls
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes
 from tetopt.system.files import check_space, kept_places
 
@@ -205,6 +206,9 @@ def _described(task: Task, initial: Mesh) -> str:
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
     start = f"{task.start_name} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    job, plan = task.plan.job, task.plan
+    if plan.mode == "graded" and plan.order == 1 and source.mask is not None and job.nodes is not None:
+        start += ", to keep thin walls" if is_for_walls(len(initial.points), job.nodes) else ""
     start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []

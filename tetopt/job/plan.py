@@ -12,7 +12,6 @@ import numpy as np
 from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
-from tetopt.engine.memory import meshing_bytes
 from tetopt.engine.meshing import (
     MODE_DEFAULTS,
     QUADRATIC_NODES,
@@ -34,6 +33,7 @@ from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.lattice import KINDS, MAX_NODES
+from tetopt.start.memory import meshing_bytes
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.files import checked_output, results_folder

@@ -23,7 +23,6 @@ from tetopt.contents.statistics import Statistics, statistics
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.fast import EXCHANGING_FRACTION
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.memory import part_bytes
 from tetopt.engine.requirements import checked_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -46,6 +45,7 @@ from tetopt.parts.work import (
     save_state,
     save_volume,
 )
+from tetopt.start.memory import part_bytes
 from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.work_directory import locked

@@ -31,6 +31,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped, lost_fraction
 from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
+from tetopt.start.memory import meshing_bytes
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
     NO_BOUND_MM,
@@ -54,8 +55,10 @@ BISECTION_STEPS = 60  # at most, for the threshold, which is then exact to the l
 TARGET_MISS = 0.25  # excess over the requested nodes at which targets within a mask are enlarged
 LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
-MOST_LOST = 0.007  # of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
-FINER_STEPS, FINER_RATIO = 3, 1.5  # of nodes, for a mask that loses more: exchanges remove up to three of four nodes
+MOST_LOST = 0.01  # of a mask's volume, apart from what flat facets cut off
+FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
+WALL_STEPS = 4  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
+LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
 LEAF_VOXELS = 2.0  # least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
 SPREAD_OF_VARIANCE = 1e-3  # of the image's variance: a base error of each voxel, to reach any number of nodes
@@ -90,7 +93,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
         the same voxels in memory, to the last bit.
     nodes : int
         Desired number of nodes. The nearest octree differs by a few per cent, or by a few dozen of a small number; it
-        has up to four times as many where a mask is thinner than its cells.
+        has up to eight times as many where a mask is thinner than its cells.
     sizes : Sizes, optional
         Targets and limits for the blocks' edges. Targets require voxels in memory.
 
@@ -250,6 +253,11 @@ def is_near(count: int, nodes: int) -> bool:
     return abs(count - nodes) <= max(LARGEST_MISS * nodes, LARGEST_MISS_NODES)
 
 
+def is_for_walls(count: int, nodes: int) -> bool:
+    """True if an initial mesh within a mask has so many nodes as only walls thinner than the cells cause."""
+    return count > (1.0 - LARGEST_MISS) * FINER_RATIO * nodes + LARGEST_MISS_NODES
+
+
 def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """Like `octree_mesh`, but accept any number of nodes if the image or the sizes allow no nearer one."""
     content = plain(image)
@@ -261,18 +269,69 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 
     Where that would lose walls thinner than its cells, it has more nodes, if these keep them; exchanges remove nodes.
     """
-    image, region, tried = content.image, content.region, list[Mesh]()
-    if region is None:
+    if content.region is None:
         return _octree_of_box(content, nodes, limits)
+    tried = list(_finer_octrees(content, nodes, limits, content.region))
+    least, first = min(tried, key=lambda each: each.lost), tried[0]
+    return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
+
+
+class _Tried(NamedTuple):
+    """An octree clipped at a mask's surface."""
+
+    mesh: Mesh
+    lost: float  # fraction of the mask's volume
+
+
+def _finer_octrees(
+    content: Content, nodes: int, limits: _BlockLimits, region: Region, first: int = 0
+) -> Iterator[_Tried]:  # fmt: skip
+    """Octrees of ever more nodes, from a `first` step, up to one that keeps the mask's walls, or as memory suffices."""
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped mesh.
     limits = _lighter(content, nodes, limits)
-    for step in range(FINER_STEPS + 1):
-        largest = max(limits.largest / FINER_RATIO ** (step / image.ndim), limits.smallest)
-        finer = limits._replace(largest=largest)
-        tried.append(_clipped_octree(content, round(nodes * FINER_RATIO**step), finer, region))
-        if lost_fraction(tried[-1], image, region) <= MOST_LOST:
-            return tried[-1]
-    return tried[0]
+    for step in range(first, FINER_STEPS + 1):
+        ratio = FINER_RATIO**step
+        largest = max(limits.largest / ratio ** (1.0 / content.image.ndim), limits.smallest)
+        try:
+            mesh = _clipped_octree(content, round(nodes * ratio), limits._replace(largest=largest), region)
+            if step > 0:
+                _check_run(content, len(mesh.points))
+        except InputError:
+            if step == first:
+                raise
+            return  # the coarser ones serve
+        lost = lost_fraction(mesh, content.image, region)
+        yield _Tried(mesh, lost)
+        if lost <= MOST_LOST:
+            return
+
+
+def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | None) -> int | None:
+    """The number of nodes with which `octree_mesh` keeps the walls of a mask that `mesh`, of fewer nodes, loses.
+
+    None if it loses none, or if no number is found.
+    """
+    region, beyond = content.region, FINER_RATIO**FINER_STEPS
+    if region is None or lost_fraction(mesh, content.image, region) <= MOST_LOST:
+        return None
+    for step in range(1, WALL_STEPS + 1):
+        enough = round(nodes * FINER_RATIO**step)
+        try:
+            tried = list(
+                _finer_octrees(content, enough, _block_limits(content, enough, sizes), region, first=FINER_STEPS)
+            )
+        except InputError:  # more nodes than voxels, or than memory has room for
+            return None
+        if tried[0].lost <= MOST_LOST:
+            return enough
+    return None
+
+
+def _check_run(content: Content, nodes: int) -> None:
+    """Raise InputError if a run that begins with so many nodes does not fit into memory."""
+    image = content.image
+    need = meshing_bytes(prod(image.shape), content.n_channels + 1, nodes, image.ndim)
+    check_memory(need, f"octree: {nodes} nodes", "use fewer nodes")
 
 
 def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Mesh:
@@ -281,7 +340,13 @@ def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: 
     nearest, in_box, fewest = list[Mesh](), nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
         try:
-            mesh = clipped(_octree_of_box(content, in_box, limits), image, region)
+            tree = _octree_of_box(content, in_box, limits)
+        except InputError:  # too many nodes for memory
+            if not nearest:
+                raise
+            break
+        try:
+            mesh = clipped(tree, image, region)
         except InputError:  # the region is thinner than the cells
             if not nearest and trial == MASK_TRIALS - 1:
                 raise
