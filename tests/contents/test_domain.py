@@ -161,6 +161,18 @@ def test_what_flat_facets_cut_off_is_not_lost(shape, spacing):
     assert lost_fraction(tetopt.Mesh(mesh.points, one), image, region) == pytest.approx(0.5, abs=0.01)
 
 
+def test_bridged_gaps_do_not_make_up_for_what_is_lost():
+    """A block whose slots of one voxel are filled has as much too much as the slab beside it has voxels."""
+    inside = np.zeros((40, 20, 20))
+    inside[:20] = inside[30:35] = 1.0
+    inside[1:20:4] = 0.0
+    image = tetopt.Image(inside)
+    box = tetopt.lattice_mesh(image, "five-tet", blocks=(8, 4, 4))
+    mesh = tetopt.Mesh(box.points, box.cells[box.points[box.cells].mean(axis=1)[:, 0] < 19.5])
+    assert mesh.cell_volumes.sum() == inside.sum()
+    assert lost_fraction(mesh, image, region_of(image)) == pytest.approx(0.25, abs=0.01)
+
+
 @pytest.mark.full
 def test_wanted_nodes_within_a_mask():
     image, mask = shaped("ball")

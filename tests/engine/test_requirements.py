@@ -1,5 +1,7 @@
 """A result says which requirements its mesh violates; each is violated by hand, one at a time."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy
@@ -243,6 +245,21 @@ def test_components_of_a_mask_without_a_cell():
     (row,) = tetopt.mask_fidelity(mask, one).lost_components
     assert row.voxels == gone.sum()
     np.testing.assert_allclose(row.place, place, atol=1e-3 * np.abs(place).max())
+
+
+def test_a_part_of_a_mask_without_cells_is_named_with_its_place():
+    """A plate that sticks out of a block, and a mesh of the block alone: what is near its cells does not count."""
+    data = np.zeros((40, 16, 16))
+    data[2:12, 2:12, 2:12] = 1.0
+    mask, box = tetopt.Image(data.copy()), tetopt.lattice_mesh(tetopt.Image(data), blocks=(20, 8, 8))
+    block = part_of(box, (np.abs(centroids(box.points, box.cells) - 6.5) < 5.0).all(axis=1))
+    assert "components" not in judged(block, content(mask, mask=mask)).violated
+    data[12:38, 2:12, 6:8] = 1.0
+    mask = tetopt.Image(data)
+    words = judged(block, content(mask, mask=mask)).violated["components"]
+    found = re.match(r"parts of the mask of 50 voxels or more with no cell near: (\d+) voxels at \(([\d.]+), ", words)
+    assert 400 < int(found[1]) < 520
+    assert 20.0 < float(found[2]) < 30.0
 
 
 def test_small_components_of_a_mask_may_be_lost_and_are_counted():

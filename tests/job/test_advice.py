@@ -83,7 +83,7 @@ def test_components_that_were_dropped_are_told(said):
     assert told(*unmet({}, {"mask": NEAR, "dropped_components": 0})) == {}
     assert said() == ""
     assert told(*unmet({}, {"mask": NEAR, "dropped_components": 2})) == {}
-    assert "dropped 2 connected components" in said()
+    assert "dropped 2 small connected components of the mesh that are not separate in the mask" in said()
     volumes = {"mask": NEAR, "dropped_components": 2, "dropped_volumes": {"3": 1.5, "0": 2.0}}
     told(*unmet({}, volumes))
     assert "as large as 3.5 voxels; " in said()
@@ -256,6 +256,17 @@ def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
     text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
+
+
+def test_thin_walls_are_the_reason_of_an_initial_mesh_that_is_far_too_large(said):
+    many = ended()._replace(initial=tetopt.Mesh(np.vstack([MESH.points, np.zeros((497, 2))]), MESH.cells))
+    reason = "(the initial mesh has 500, to keep thin walls of the mask)"
+    for n_nodes, nodes, measured, is_told in (
+        (200, 100, {"mask": NEAR}, True), (200, 100, {}, False), (400, 350, {"mask": NEAR}, False),
+        (80, 100, {"mask": NEAR}, False),
+    ):  # fmt: skip
+        told(*of_result(many, "fast", "graded", n_nodes, nodes, measured))
+        assert said().startswith(f"{n_nodes} nodes instead of {nodes}{f' {reason}' * is_told}; ")
 
 
 def test_remedies_of_a_missed_number_of_nodes_are_those_that_apply(said):

@@ -10,6 +10,7 @@ from scipy import ndimage
 import tetopt
 from tetopt.contents.noise import noise_level
 from tetopt.start import octree
+from tetopt.start.clip import lost_fraction
 from tetopt.start.octree import _dilated, octree_mesh
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
@@ -216,13 +217,26 @@ def test_rings_of_blocks(shape, n_rings):
     np.testing.assert_array_equal(chosen, before)
 
 
-def test_a_wall_thinner_than_the_cells_is_whole():
-    """Of a shell of two voxels, an octree of 500 nodes would lose a third; it has more, which the run removes."""
-    off = np.abs(np.linalg.norm(grid(26, 26, 26) - 12.5, axis=-1) - 9.0)
+def shell(size, radius):
+    """A mask of a sphere's wall of two voxels."""
+    off = np.abs(np.linalg.norm(grid(size, size, size) - 0.5 * (size - 1), axis=-1) - radius)
     mask = tetopt.Image(1.0 * (off < 1.0))
-    content, ideal = tetopt.content(mask, mask=mask), 4.0 / 3.0 * np.pi * (10.0**3 - 8.0**3)
+    return tetopt.content(mask, mask=mask)
+
+
+def lost(content, mesh):
+    return lost_fraction(mesh, content.image, content.region)
+
+
+def test_a_wall_thinner_than_the_cells_is_whole():
+    """Of a shell of two voxels, an octree of 500 nodes would lose a third; it has more, which the run removes.
+
+    With the bound on edges of 500 nodes, 1440 would be needed.
+    """
+    content, ideal = shell(26, 9.0), 4.0 / 3.0 * np.pi * (10.0**3 - 8.0**3)
     start = octree_mesh(content, 500)
-    assert 500 < len(start.points) < 2000
+    assert 500 < len(start.points) < 1200
+    assert octree.is_for_walls(len(start.points), 500)
     assert start.cell_volumes.sum() == pytest.approx(ideal, rel=0.02)
     result = tetopt.mesh_image(content, nodes=500)
     assert len(result.mesh.points) == 500
@@ -230,10 +244,39 @@ def test_a_wall_thinner_than_the_cells_is_whole():
     assert result.violated == {}
 
 
-def test_a_mask_that_no_octree_keeps_has_the_nearest_number_of_nodes(monkeypatch):
-    off = np.abs(np.linalg.norm(grid(60, 60, 60) - 29.5, axis=-1) - 25.0)
-    mask = tetopt.Image(1.0 * (off < 1.0))
-    content = tetopt.content(mask, mask=mask)
+def test_a_wall_that_no_octree_keeps_has_the_one_that_loses_least():
+    """Nearly all would be lost with the requested nodes; the number named keeps it."""
+    content = shell(34, 13.0)
+    mesh = octree_mesh(content, 300)
+    assert octree.MOST_LOST < lost(content, mesh) < 0.05
+    enough = octree.nodes_for_walls(content, mesh, 300, None)
+    whole = octree_mesh(content, enough)
+    assert lost(content, whole) < octree.MOST_LOST
+    assert octree.nodes_for_walls(content, whole, enough, None) is None
+
+
+def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_nodes(monkeypatch):
+    content = shell(60, 25.0)
+    monkeypatch.setattr(octree, "FINER_STEPS", 2)
     mesh = octree_mesh(content, 300)
     monkeypatch.setattr(octree, "FINER_STEPS", 0)
     np.testing.assert_array_equal(mesh.points, octree_mesh(content, 300).points)
+
+
+def test_the_memory_of_a_finer_octree_ends_the_search_not_the_run(monkeypatch):
+    content = shell(26, 9.0)
+    monkeypatch.setattr(octree, "meshing_bytes", lambda voxels, channels, nodes, ndim: 1e18 * (nodes > 900))
+    mesh = octree_mesh(content, 200)
+    assert len(mesh.points) == 588  # of 314, 206, 514, 588 and 958
+    monkeypatch.setattr(octree, "check_memory", lambda *words: (_ for _ in ()).throw(tetopt.InputError("no memory")))
+    with pytest.raises(tetopt.InputError, match="no memory"):
+        octree_mesh(content, 500)
+
+
+def test_a_run_that_loses_a_wall_names_the_nodes_that_keep_it(monkeypatch):
+    monkeypatch.setattr(octree, "FINER_STEPS", 1)
+    content = shell(26, 9.0)
+    result = tetopt.mesh_image(content, nodes=300, iterations=0)
+    words = result.violated["mask"]
+    enough = int(words.rpartition("allow more nodes, about ")[2])
+    assert lost(content, octree_mesh(content, enough)) < octree.MOST_LOST

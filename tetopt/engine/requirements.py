@@ -210,8 +210,8 @@ def _violated_components(content: Content, region: Region, mesh: Mesh, owner: ND
     large = [(each, "") for each in lost if each.voxels >= COMPONENT_VOXELS]
     texts += [f"components of the mask {LARGE_COMPONENTS} without a cell: {_listed(large)}"] if large else []
     bare = _bare_parts(mesh, region.inside[planes] & (owner[planes] < 0), affine)
-    bare = [(each, "") for each in bare if each.voxels >= COMPONENT_VOXELS and each not in lost]
-    texts += [f"parts of the mask {LARGE_COMPONENTS} with no cell near: {_listed(bare)}"] if bare and not large else []
+    far = [(each, "") for each in bare if each.voxels >= COMPONENT_VOXELS]
+    texts += [f"parts of the mask {LARGE_COMPONENTS} with no cell near: {_listed(far)}"] if far and not large else []
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
@@ -224,7 +224,8 @@ def _bare_parts(
     longest = np.zeros(len(mesh.points))
     np.maximum.at(longest, ends, length[:, None])
     index = np.argwhere(is_bare)
-    distance, node = scipy.spatial.cKDTree(mesh.points).query(transformed(index, affine[:-1, :-1]) + affine[:-1, -1])
+    places = transformed(index.astype(np.float64), affine[:-1, :-1]) + affine[:-1, -1]
+    distance, node = scipy.spatial.cKDTree(mesh.points).query(places)
     is_far = np.zeros_like(is_bare)
     is_far[tuple(index[distance > longest[node]].T)] = True
     return voxel_components(is_far, np.zeros_like(is_far), affine)[1]
