@@ -27,7 +27,7 @@ LEAST_FULLNESS = 0.2  # least `_fullness` of a cell when nodes move onto the sur
 LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
 SNAP_STEPS = 8  # Newton steps towards the surface
 VOLUME_POINTS = 2**16  # for the volume of cells outside a region: a tenth is exact to 0.1 % of all
-OVERHANG = 2.5  # of the volume that facets cut off outside: without gaps, cells lie outside by 1.3 to 2.2 of it
+OVERHANG_RATIO = 2.5  # of the volume that facets cut off outside: without gaps, cells lie outside by 1.3 to 2.2 of it
 BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to 1e-6 of its length
 
 
@@ -72,7 +72,7 @@ def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
     area = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1))) / factorial(image.ndim - 1)
     cut_off = -area * levels(region.level, centre[is_open]) * image.ndim / (image.ndim + 1)
     volume = mesh.cell_volumes / image.voxel_volume
-    bridged = _volume_outside(region, index[mesh.cells], volume) + OVERHANG * np.minimum(cut_off, 0.0).sum()
+    bridged = _volume_outside(region, index[mesh.cells], volume) + OVERHANG_RATIO * np.minimum(cut_off, 0.0).sum()
     covered = volume.sum() + cut_off.sum() - max(bridged, 0.0)
     return float(1.0 - covered / region.inside.sum())
 
