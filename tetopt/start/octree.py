@@ -57,7 +57,8 @@ LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within 
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 MOST_LOST = 0.007  # of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
 FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
-WALL_STEPS = 4  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
+STALLED_FRACTION = 0.9  # of what an octree loses: if the next one loses more, finer cells are no remedy
+WALL_STEPS = 2  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
 LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
 LEAF_VOXELS = 2.0  # least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
@@ -286,9 +287,9 @@ class _Tried(NamedTuple):
 def _finer_octrees(
     content: Content, nodes: int, limits: _BlockLimits, region: Region, first: int = 0
 ) -> Iterator[_Tried]:  # fmt: skip
-    """Octrees of ever more nodes, from a `first` step, up to one that keeps the mask's walls, or as memory suffices."""
+    """Octrees of ever more nodes, from a `first` step, while they lose walls, but ever less, and memory suffices."""
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped mesh.
-    limits = _lighter(content, nodes, limits)
+    limits, lost = _lighter(content, nodes, limits), np.inf
     for step in range(first, FINER_STEPS + 1):
         ratio = FINER_RATIO**step
         largest = max(limits.largest / ratio ** (1.0 / content.image.ndim), limits.smallest)
@@ -300,9 +301,9 @@ def _finer_octrees(
             if step == first:
                 raise
             return  # the coarser ones serve
-        lost = lost_fraction(mesh, content.image, region)
+        before, lost = lost, lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
-        if lost <= MOST_LOST:
+        if lost <= MOST_LOST or lost > STALLED_FRACTION * before:
             return
 
 
