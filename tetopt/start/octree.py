@@ -57,8 +57,10 @@ LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within 
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 MOST_LOST = 0.007  # of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
 FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
-STALLED_FRACTION = 0.9  # of what an octree loses: if the next one loses more, finer cells are no remedy
-WALL_STEPS = 2  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
+# of a mask's volume, and of what an octree loses: if the next one loses less than the one but more than the other, as
+# of a rough mask, finer cells are no remedy; coarse ones lose a wall by chance, and may first lose more
+SMALL_LOSS, STALLED_FRACTION = 0.1, 0.9
+WALL_STEPS = 3  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
 LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
 LEAF_VOXELS = 2.0  # least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
@@ -303,7 +305,7 @@ def _finer_octrees(
             return  # the coarser ones serve
         before, lost = lost, lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
-        if lost <= MOST_LOST or lost > STALLED_FRACTION * before:
+        if lost <= MOST_LOST or STALLED_FRACTION * before < lost < SMALL_LOSS:
             return
 
 
