@@ -6,7 +6,7 @@ import naive
 import numpy as np
 import pytest
 from meshes import delaunay_box
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from shapes import distance
 
 import tetopt
@@ -330,6 +330,9 @@ def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept)
     made = labelled(points, cells, across_of(cells, len(points)), contents, [np.array([1])] * 2, weight=1e-9)
     assert (made[piece] == 1) == is_kept
     assert (made != labels).sum() == is_kept
+    twice = Contents(csr_array(full), None, vstack([pieces, pieces]).tocsr(), np.array([1, 1]))
+    again = labelled(points, cells, across_of(cells, len(points)), twice, [np.array([1])] * 2, weight=1e-9)
+    assert again.tolist() == made.tolist()
     assert naive.nonmanifold(cells, made) == {}
 
 
@@ -383,3 +386,4 @@ def test_pieces_of_labels_are_large_components_but_the_largest():
     assert pieces.label.tolist() == [1, 1]
     for k, box in enumerate((np.s_[:4, :4, :4], np.s_[5:10, 5:10, 5:7])):
         assert pieces.voxels[pieces.piece == k].tolist() == number[box].ravel().tolist()
+    assert label_voxels(partition, np.ones(3), 3, parts=2).pieces.label.tolist() == []  # of 32 and 25 whole voxels

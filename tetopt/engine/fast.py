@@ -433,7 +433,7 @@ class Run:
         if self.label_voxels is None:
             region, rows = self.content.region, members.partition
             rows = rows if region is None else np.where(region.inside, rows, OUTSIDE_LABEL)
-            self.label_voxels = label_voxels(rows, self.image.spacing, len(members.labels))
+            self.label_voxels = label_voxels(rows, self.image.spacing, len(members.labels), members.parts)
         self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.label_voxels)
         self.has_labels = True
         self.hope[:] = np.inf

@@ -40,7 +40,7 @@ def with_labels(
     `voxels` is the information on the labels' voxels (`label_voxels`), if known.
     """
     members, tension, own_channel, own_value, keeps_volumes = smooth
-    voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels))
+    voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels), members.parts)
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     contents = cell_contents(image, members, mesh, voxels)

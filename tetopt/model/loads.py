@@ -290,7 +290,7 @@ def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
     if share < SMALL_SIDE:
         count, along = len(sets.facets[name]), (mesh.points * normal).sum(axis=1)
         vectors = (mesh.points[along.argmax()], normal, [SIDE_DEPTH * np.ptp(along)])
-        plane = ":".join(",".join(f"{round(number, 3) + 0.0:g}" for number in each) for each in vectors)
+        plane = ":".join(",".join(f"{number + 0.0:.4g}" for number in each) for each in vectors)
         what = f"{count} facet{'s' * (count > 1)}, {100.0 * share:.2g} % of the area that the mesh shows to that side"
         warn(
             f'load: set "{name}" is only {what}; hold or move a larger set instead, such as that of `sets` '

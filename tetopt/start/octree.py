@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.contents.domain import Region
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.image import Image, check_in_memory
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped, lost_fraction
@@ -60,6 +60,7 @@ FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to
 # of a mask's volume, and of what an octree loses: if the next one loses less than the one but more than the other, as
 # of a rough mask, finer cells are no remedy; coarse ones lose a wall by chance, and may first lose more
 SMALL_LOSS, STALLED_FRACTION = 0.1, 0.9
+MOST_WALL_NODES = 300_000  # of an octree in that search, which takes seconds
 WALL_STEPS = 3  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
 LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
@@ -270,7 +271,8 @@ def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = Non
 def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree within the limits with the nearest number of nodes, clipped at the mask's surface.
 
-    Where that would lose walls thinner than its cells, it has more nodes, if these keep them; exchanges remove nodes.
+    Where that would lose walls thinner than its cells, it has more nodes, if these keep them or lose at most half as
+    much; exchanges remove nodes.
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
@@ -299,10 +301,11 @@ def _finer_octrees(
             mesh = _clipped_octree(content, round(nodes * ratio), limits._replace(largest=largest), region)
             if step > 0:
                 _check_run(content, len(mesh.points))
-        except InputError:
+        except InputError as error:
             if step == first:
                 raise
-            return  # the coarser ones serve
+            warn(f"{error}: the initial mesh has walls of the mask with fewer nodes than it would have")
+            return
         before, lost = lost, lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
         if lost <= MOST_LOST or STALLED_FRACTION * before < lost < SMALL_LOSS:
@@ -318,6 +321,8 @@ def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | Non
         return None
     for step in range(1, WALL_STEPS + 1):
         enough = round(nodes * FINER_RATIO**step)
+        if enough * FINER_RATIO**FINER_STEPS > MOST_WALL_NODES:
+            return None
         try:
             limits = _block_limits(content, enough, sizes)
             finest = next(_finer_octrees(content, enough, limits, region, first=FINER_STEPS))
