@@ -96,7 +96,7 @@ class Contents(NamedTuple):
 
     counts: scipy.sparse.csr_array  # (M, K) voxels of each label, with fractions of a voxel; no row is empty
     contacts: Contacts | None = None
-    pieces: scipy.sparse.csr_array = scipy.sparse.csr_array((0, 0))  # (P, M) voxels of each of `Pieces`
+    pieces: scipy.sparse.csr_array | None = None  # (P, M) voxels of each of `Pieces`
     label_of_piece: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # (P,)
 
 
@@ -260,7 +260,9 @@ def _keep_pieces(
     Cells with which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,), as mending would
     give most others away again.
     """
-    n_of, pieces = np.bincount(labels, minlength=len(dual.bias)), contents.pieces
+    if (pieces := contents.pieces) is None:
+        return
+    n_of = np.bincount(labels, minlength=len(dual.bias))
     for piece, label in enumerate(contents.label_of_piece):
         own = slice(pieces.indptr[piece], pieces.indptr[piece + 1])
         cells, volume = pieces.indices[own], voxel * pieces.data[own]
