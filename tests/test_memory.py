@@ -19,12 +19,12 @@ from tetopt.contents.content import content, plain
 from tetopt.contents.memberships import memberships
 from tetopt.energy.sampling import sampling_grid
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.meshing import bytes_of, process_bytes
+from tetopt.engine.meshing import process_bytes
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
 from tetopt.job.events import listened, progress, started
 from tetopt.job.meshing import left_words, watched
-from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, MESHED_CELL_BYTES, meshing_bytes, next_bytes
+from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, MESHED_CELL_BYTES, bytes_of, meshing_bytes, next_bytes
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of
 from tetopt.system import budget

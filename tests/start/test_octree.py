@@ -265,7 +265,7 @@ def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_
 
 def test_the_memory_of_a_finer_octree_ends_the_search_not_the_run(monkeypatch):
     content = shell(26, 9.0)
-    monkeypatch.setattr(octree, "meshing_bytes", lambda voxels, channels, nodes, ndim: 1e18 * (nodes > 900))
+    monkeypatch.setattr(octree, "bytes_of", lambda content, nodes: 1e18 * (nodes > 900))
     mesh = octree_mesh(content, 200)
     assert len(mesh.points) == 588  # of 314, 206, 514, 588 and 958
     monkeypatch.setattr(octree, "check_memory", lambda *words: (_ for _ in ()).throw(tetopt.InputError("no memory")))

@@ -396,9 +396,8 @@ class Run:
         Targets can be reached from any mesh, even one with a tenth of the nodes; moving nodes first would be futile.
         """
         n_changes = n_last = self.exchange(nodes, sizes)
-        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_FRACTION * nodes:
-            if is_over():
-                break
+        most = EXCHANGED_FRACTION * nodes
+        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > most and not is_over():
             n_last = self.exchange(nodes, sizes)
             n_changes += n_last
         return n_changes

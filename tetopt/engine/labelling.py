@@ -266,10 +266,12 @@ def _keep_pieces(
     for piece, label in enumerate(contents.label_of_piece):
         own = slice(pieces.indptr[piece], pieces.indptr[piece + 1])
         cells, volume = pieces.indices[own], voxel * pieces.data[own]
+        if (labels[cells] == label).any():
+            continue
         size = dual.size[cells]
         is_fit = (volume >= PIECE_SHARE * size) & (size <= MOST_FILLED * volume.sum())
         is_fit &= (n_of[labels[cells]] > 1) & ~is_kept[cells]
-        if not is_fit.any() or (labels[cells] == label).any():
+        if not is_fit.any():
             continue
         fit = cells[is_fit][np.argsort(-(2.0 * volume - size)[is_fit], kind="stable")]
         best = next((cell for cell in fit[:TRIED_CELLS] if _is_manifold(dual, labels, cell, label)), fit[0])
@@ -352,9 +354,8 @@ def label_voxels(
         is_met, here = is_apart[rows[:-1], rows[1:]], np.moveaxis(is_place, d, 0)
         here[:-1] |= is_met
         here[1:] |= is_met
-    return LabelVoxels(
-        *_components(partition, n_labels, parts * COMPONENT_VOXELS), is_apart[:-1, :-1].copy(), np.flatnonzero(is_place)
-    )
+    sizes, pieces = _components(partition, n_labels, parts * COMPONENT_VOXELS)
+    return LabelVoxels(sizes, pieces, is_apart[:-1, :-1].copy(), np.flatnonzero(is_place))
 
 
 def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -778,7 +779,8 @@ def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) ->
     return np.stack([volume - bounds[0], bounds[1] - volume])
 
 
-def _mend_pairs(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64], is_bridge: NDArray[np.bool_],
+def _mend_pairs(
+    dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64], is_bridge: NDArray[np.bool_],
     has_pairs: bool = False,
 ) -> None:  # fmt: skip
     """Mend the remaining places between two labels, but for bridges; `has_pairs` as of `_mend`."""

@@ -43,7 +43,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
-from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, meshing_bytes
+from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, bytes_of
 from tetopt.start.octree import is_near, nearest_octree, nodes_for_walls, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import at_most, check_memory
@@ -328,12 +328,6 @@ def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
 def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) -> MeshingResult:
     """Add components dropped from the initial mesh to those that a run dropped."""
     return result._replace(n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped))
-
-
-def bytes_of(content: Content, nodes: int) -> float:
-    """Additional memory for meshing a content with `nodes` nodes; see `tetopt.start.memory.meshing_bytes`."""
-    image = content.image
-    return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
 
 
 def process_bytes(content: Content, nodes: int) -> float:

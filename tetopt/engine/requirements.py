@@ -27,8 +27,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
-from tetopt.geometry.quadratic import edge_ends
-from tetopt.geometry.simplex import dihedral_angles
+from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
@@ -215,14 +214,10 @@ def _violated_components(content: Content, region: Region, mesh: Mesh, owner: ND
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
-def _bare_parts(
-    mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]
-) -> tuple[LostComponent, ...]:  # fmt: skip
+def _bare_parts(mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[LostComponent, ...]:
     """Components of a mask's voxels without a cell that lie farther from the nearest node than its longest edge."""
-    ends = edge_ends(mesh.cells).reshape(-1, 2)
-    length = np.linalg.norm(np.diff(mesh.points[ends], axis=1)[:, 0], axis=1)
-    longest = np.zeros(len(mesh.points))
-    np.maximum.at(longest, ends, length[:, None])
+    ends, longest = mesh.cells[:, edge_pairs(mesh.ndim)], np.zeros(len(mesh.points))
+    np.maximum.at(longest, ends, np.sqrt(squared_edges(mesh.points, mesh.cells))[:, :, None])
     index = np.argwhere(is_bare)
     places = transformed(index.astype(np.float64), affine[:-1, :-1]) + affine[:-1, -1]
     distance, node = scipy.spatial.cKDTree(mesh.points).query(places)

@@ -23,7 +23,6 @@ from tetopt.engine.meshing import (
     Aim,
     MeshSearch,
     Run,
-    bytes_of,
     check_memory_of,
 )
 from tetopt.engine.requirements import unexplained_by
@@ -39,7 +38,7 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
-from tetopt.start.memory import next_bytes
+from tetopt.start.memory import bytes_of, next_bytes
 from tetopt.start.octree import is_for_walls
 from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes
 from tetopt.system.files import check_space, kept_places

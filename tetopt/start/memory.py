@@ -6,6 +6,10 @@ peaks. A run with labels of 7 million voxels has taken 23 % more.
 
 from __future__ import annotations
 
+from math import prod
+
+from tetopt.contents.content import Content
+
 KERNEL_BYTES = 2.5e8  # numba's compiler, all kernels if not yet loaded, and buffers: at most 220 MB
 CHANNEL_BYTES = 8.266  # per voxel and channel, in the octree, later in prefix sums
 MESHED_CELL_BYTES = 617.8  # with fluxes and sums
@@ -34,6 +38,12 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
     """
     n_bytes = CHANNEL_BYTES * (n_voxels * n_channels) + MESHED_CELL_BYTES * (CELLS_PER_NODE[ndim] * n_nodes)
     return KERNEL_BYTES + BOUND_MARGIN * n_bytes
+
+
+def bytes_of(content: Content, nodes: int) -> float:
+    """Additional memory for meshing a content with `nodes` nodes; see `meshing_bytes`."""
+    image = content.image
+    return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
 
 
 def part_bytes(n_voxels: int, n_cells: int) -> float:

@@ -31,7 +31,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped, lost_fraction
 from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
-from tetopt.start.memory import meshing_bytes
+from tetopt.start.memory import bytes_of
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
     NO_BOUND_MM,
@@ -276,8 +276,10 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
-    tried = list(_finer_octrees(content, nodes, limits, content.region))
-    least, first = min(tried, key=lambda each: each.lost), tried[0]
+    tried = _finer_octrees(content, nodes, limits, content.region)
+    first = least = next(tried)
+    for each in tried:
+        least = min(least, each, key=lambda octree: octree.lost)
     return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
 
 
@@ -300,7 +302,9 @@ def _finer_octrees(
         try:
             mesh = _clipped_octree(content, round(nodes * ratio), limits._replace(largest=largest), region)
             if step > 0:
-                _check_run(content, len(mesh.points))
+                check_memory(
+                    bytes_of(content, len(mesh.points)), f"octree: {len(mesh.points)} nodes", "use fewer nodes"
+                )
         except InputError as error:
             if step == first:
                 raise
@@ -331,13 +335,6 @@ def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | Non
         if finest.lost <= MOST_LOST:
             return enough
     return None
-
-
-def _check_run(content: Content, nodes: int) -> None:
-    """Raise InputError if a run that begins with so many nodes does not fit into memory."""
-    image = content.image
-    need = meshing_bytes(prod(image.shape), content.n_channels + 1, nodes, image.ndim)
-    check_memory(need, f"octree: {nodes} nodes", "use fewer nodes")
 
 
 def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Mesh:
