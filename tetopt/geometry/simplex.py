@@ -76,6 +76,17 @@ def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
     return np.stack([np.sqrt(_dot(normal, normal)) for normal in _facet_normals(points, cells)], axis=1)
 
 
+def area_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normals (K, n) of facets with corners (K, n, n), as long as their areas, mm^2 (in 2-D mm).
+
+    They point to the side from which three corners turn anticlockwise; in 2-D to the right of first to second.
+    """
+    edges = corners[:, 1:] - corners[:, :1]
+    if corners.shape[2] == 3:
+        return 0.5 * np.cross(edges[:, 0], edges[:, 1])
+    return edges[:, 0, ::-1] * np.array([1.0, -1.0])
+
+
 def regular_edge(size: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     """Edge, mm, of the regular n-simplex of a given volume, mm^n."""
     return (6.0 * 2.0**0.5 * size) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * size) ** 0.5

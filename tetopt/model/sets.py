@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
-from tetopt.geometry.simplex import outward_facet_nodes
+from tetopt.geometry.simplex import area_normals, outward_facet_nodes
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
@@ -110,11 +110,7 @@ def is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
 
 def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the outward area vectors of facets (K, 2), (K, n), mm2 (in 2-D mm)."""
-    corners = mesh.points[facet_triples(mesh.cells, rows)]
-    edges = corners[:, 1:] - corners[:, :1]
-    if mesh.ndim == 3:
-        return 0.5 * np.cross(edges[:, 0], edges[:, 1])
-    return edges[:, 0, ::-1] * np.array([1.0, -1.0])
+    return area_normals(mesh.points[facet_triples(mesh.cells, rows)])
 
 
 def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
