@@ -86,7 +86,7 @@ def test_small_cells_are_filled_by_levels_not_by_centres():
 
 @pytest.mark.parametrize("spacing", [1.7, 5.5])
 def test_contents_of_cells_are_those_of_a_plain_count(spacing):
-    """Cells with many centres hold those; others samples, and centres of a label that samples hardly show."""
+    """Cells with many centres hold those, others samples, in their volume; and centres that samples hardly show."""
     data = np.random.default_rng(3).integers(1, 4, (12, 13, 14)).astype(float)
     data[:6], data[8, 8, 8] = 1.0, 4.0
     image = tetopt.Image(data)
@@ -95,12 +95,13 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
     contents = cell_contents(image, members, mesh, voxels)
     counts = contents.counts
     owner, aim = tetopt.cell_of_voxel(image, mesh), np.zeros(counts.shape)
-    is_few = np.bincount(owner.ravel(), minlength=len(aim)) < FEWEST_CENTRES
+    n_owned = np.bincount(owner.ravel(), minlength=len(aim))
+    is_few = n_owned < FEWEST_CENTRES
     there = labels_at(members, image.to_index(mesh.points), mesh.cells, PART_CENTRES[3])
-    share = volumes(mesh.points, mesh.cells) / len(PART_CENTRES[3])
+    share = volumes(mesh.points, mesh.cells) / np.where(is_few, len(PART_CENTRES[3]), n_owned)
     for cell in range(len(aim)):
         for label in there[cell] if is_few[cell] else members.partition[owner == cell]:
-            aim[cell, label] += share[cell] if is_few[cell] else 1.0
+            aim[cell, label] += share[cell]
     seen = aim.sum(axis=0)
     for place, label in np.ndenumerate(members.partition):
         if seen[label] < SAMPLED_FRACTION * (members.partition == label).sum() and is_few[owner[place]]:
@@ -110,6 +111,16 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
     assert counts.has_sorted_indices
     assert counts.toarray() == pytest.approx(aim, abs=1e-12)
     assert contents.contacts.is_place.sum() == len(np.unique(owner.ravel()[voxels.places]))
+
+
+def test_labels_have_their_volume_in_cells_of_about_as_many_centres_as_are_counted():
+    """Some of these cells have more centres than their volume, others fewer; only the former's are counted."""
+    image = tetopt.Image(np.random.default_rng(1).integers(0, 2, (24, 24, 24)).astype(float))
+    mesh, members = tetopt.lattice_mesh(image, spacing=5.9), memberships(image)
+    n_owned = np.bincount(tetopt.cell_of_voxel(image, mesh).ravel())
+    assert 0.2 < (n_owned < FEWEST_CENTRES).mean() < 0.8
+    contents = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2))
+    assert contents.counts.sum(axis=1) == pytest.approx(mesh.cell_volumes)
 
 
 def slab(n, cubes):

@@ -94,7 +94,8 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
         rows = threads.map(lambda part: labels_at(members, index, mesh.cells[part], inner), parts)
         for part, there in zip(parts, rows, strict=True):
             entries[start[part, None] + np.arange(len(inner))] = there
-    each = np.where(is_sampled, np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / len(inner), 1.0)
+    # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their volume are counted.
+    each = np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / np.where(is_sampled, len(inner), n_owned)
     first = np.zeros(n_cells + 1, dtype=np.int64)
     _count_kinds(first, entries, start, n_labels)
     np.cumsum(first, out=first)
