@@ -254,7 +254,27 @@ def test_facets_across_a_torn_wall_do_not_make_up_for_it(monkeypatch):
     monkeypatch.setattr(octree, "FINER_STEPS", 0)
     torn = octree_mesh(content, 1500)
     missing = 1.0 - torn.cell_volumes.sum() / mask.data.sum()
-    assert 0.1 < missing < lost(content, torn) + 0.03
+    assert 0.1 < missing < lost(content, torn) + 0.05  # some facets cross it obliquely
+
+
+def test_one_octree_that_loses_more_by_chance_does_not_end_the_search():
+    """Of this tube, the third octree loses more than the second, the fourth next to nothing."""
+    along = grid(60, 60, 60) - 30.0
+    is_wall = np.abs(np.linalg.norm(along[..., :2], axis=-1) - 20.0) < 1.5
+    mask = tetopt.Image(1.0 * (is_wall & (np.abs(along[..., 2]) < 25.0)))
+    mesh = octree_mesh(tetopt.content(mask, mask=mask), 1500)
+    assert mesh.cell_volumes.sum() == pytest.approx(mask.data.sum(), rel=0.02)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 3.0])
+def test_facets_of_a_ball_cut_off_what_it_lacks(monkeypatch, sigma):
+    """Also of a blurred one, whose level rises by an eighth per voxel, not by 1, so that depths count for less."""
+    monkeypatch.setattr(octree, "FINER_STEPS", 0)
+    ball = np.linalg.norm(grid(40, 40, 40) - 19.5, axis=-1) < 14.0
+    mask = tetopt.Image(ndimage.gaussian_filter(1.0 * ball, sigma))
+    content = tetopt.content(mask, mask=mask)
+    mesh = octree_mesh(content, 300)
+    assert lost(content, mesh) < 0.9 * (1.0 - mesh.cell_volumes.sum() / content.region.inside.sum())
 
 
 def test_a_wall_that_no_octree_keeps_has_the_one_that_loses_least():

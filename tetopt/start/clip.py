@@ -26,7 +26,7 @@ LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
 SNAP_STEPS = 8  # Newton steps towards the surface
 VOLUME_POINTS = 2**16  # for the volume of cells outside a region: a tenth is exact to 0.1 % of all
 OVERHANG_RATIO = 2.5  # of the volume that facets cut off outside: without gaps, cells lie outside by 1.3 to 2.2 of it
-LEAST_RISE = 0.3  # of the level along the normal of a facet that cuts off volume: 1 on a surface, 0 across a wall
+LEAST_RISE = 0.3  # of the usual slope, along the normal of a facet that cuts off volume: across a wall there is none
 BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to 1e-6 of its length
 
 
@@ -61,18 +61,20 @@ def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
     """Fraction of a region's volume, as of thin walls, without cells, apart from what a mesh's flat facets cut off.
 
     Facets with corners on a round surface have on average n / (n + 1) of the depth of their centres within it; those
-    that cross a torn wall, along whose normals the level hardly changes, cut nothing off. Cells that bridge gaps of the
-    region do not make up for lost walls.
+    inside that cross a torn wall, along whose normals the level hardly changes, cut nothing off; those that cross it
+    obliquely count. Cells that bridge gaps of the region do not make up for lost walls.
     """
     index = image.to_index(mesh.points)
     facets = boundary_facets(mesh.cells)
     centre = index[facets].mean(axis=1)
     is_open = ~is_on_sides(centre, box_sides(image.shape)).any(axis=(1, 2))
-    normal, centre = area_normals(index[facets[is_open]]), centre[is_open]
-    area, level = np.linalg.norm(normal, axis=1), levels(region.level, centre)
-    rise = np.abs((_slopes(region.level, centre) * normal).sum(axis=1))
-    cut_off = np.where((rise >= LEAST_RISE * area) | (level > 0.0), area, 0.0)
-    cut_off *= -level * image.ndim / (image.ndim + 1)
+    centre, normal = centre[is_open], area_normals(index[facets[is_open]])
+    level, slope = levels(region.level, centre), _slopes(region.level, centre)
+    area = np.linalg.norm(normal, axis=1)
+    # The level of a mask of fractions has their slope, which is less than 1 at a blurred surface.
+    least_rise = LEAST_RISE * min(float(np.median(np.linalg.norm(slope, axis=1))), 1.0) * area
+    is_surface = (level > 0.0) | (np.abs((slope * normal).sum(axis=1)) >= least_rise)
+    cut_off = np.where(is_surface, -area * level * image.ndim / (image.ndim + 1), 0.0)
     volume = mesh.cell_volumes / image.voxel_volume
     bridged = _volume_outside(region, index[mesh.cells], volume) + OVERHANG_RATIO * np.minimum(cut_off, 0.0).sum()
     covered = volume.sum() + cut_off.sum() - max(bridged, 0.0)

@@ -57,9 +57,9 @@ LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within 
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
 MOST_LOST = 0.007  # of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
 FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
-# of a mask's volume, and of what an octree loses: if the next one loses less than the one but more than the other, as
-# of a rough mask, finer cells are no remedy; coarse ones lose a wall by chance, and may first lose more
-SMALL_LOSS, STALLED_FRACTION = 0.1, 0.9
+# of a mask's volume, and of the least that octrees lose: if some in a row lose less than the one but more than the
+# other, as of a rough mask, finer cells are no remedy; a single one loses a wall by chance, as coarse ones do
+SMALL_LOSS, STALLED_FRACTION, STALLED_STEPS = 0.1, 0.9, 2
 MOST_WALL_NODES = 300_000  # of an octree in that search, which takes seconds
 WALL_STEPS = 3  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
 LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
@@ -274,13 +274,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     Where that would lose walls thinner than its cells, it has more nodes, if these keep them or lose at most half as
     much; exchanges remove nodes.
     """
-    if content.region is None:
-        return _octree_of_box(content, nodes, limits)
-    tried = _finer_octrees(content, nodes, limits, content.region)
-    first = least = next(tried)
-    for each in tried:
-        least = min(least, each, key=lambda octree: octree.lost)
-    return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
+    return _octree_of_box(content, nodes, limits) if content.region is None else _walled(content, nodes, limits).mesh
 
 
 class _Tried(NamedTuple):
@@ -290,13 +284,21 @@ class _Tried(NamedTuple):
     lost: float  # fraction of the mask's volume
 
 
-def _finer_octrees(
-    content: Content, nodes: int, limits: _BlockLimits, region: Region, first: int = 0
-) -> Iterator[_Tried]:  # fmt: skip
-    """Octrees of ever more nodes, from a `first` step, while they lose walls, but ever less, and memory suffices."""
+def _walled(content: Content, nodes: int, limits: _BlockLimits) -> _Tried:
+    """`_octree_within` a mask, and what it loses."""
+    assert content.region is not None
+    tried = _finer_octrees(content, nodes, limits, content.region)
+    first = least = next(tried)
+    for each in tried:
+        least = min(least, each, key=lambda octree: octree.lost)
+    return least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first
+
+
+def _finer_octrees(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Iterator[_Tried]:
+    """Octrees of ever more nodes, while they lose walls, but less than all before, and memory suffices."""
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped mesh.
-    limits, lost = _lighter(content, nodes, limits), np.inf
-    for step in range(first, FINER_STEPS + 1):
+    limits, least, n_stalled = _lighter(content, nodes, limits), np.inf, 0
+    for step in range(FINER_STEPS + 1):
         ratio = FINER_RATIO**step
         largest = max(limits.largest / ratio ** (1.0 / content.image.ndim), limits.smallest)
         try:
@@ -306,13 +308,15 @@ def _finer_octrees(
                     bytes_of(content, len(mesh.points)), f"octree: {len(mesh.points)} nodes", "use fewer nodes"
                 )
         except InputError as error:
-            if step == first:
+            if step == 0:
                 raise
             warn(f"{error}: the initial mesh has walls of the mask with fewer nodes than it would have")
             return
-        before, lost = lost, lost_fraction(mesh, content.image, region)
+        lost = lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
-        if lost <= MOST_LOST or STALLED_FRACTION * before < lost < SMALL_LOSS:
+        n_stalled = n_stalled + 1 if STALLED_FRACTION * least < lost < SMALL_LOSS else 0
+        least = min(least, lost)
+        if lost <= MOST_LOST or n_stalled == STALLED_STEPS:
             return
 
 
@@ -328,12 +332,10 @@ def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | Non
         if enough * FINER_RATIO**FINER_STEPS > MOST_WALL_NODES:
             return None
         try:
-            limits = _block_limits(content, enough, sizes)
-            finest = next(_finer_octrees(content, enough, limits, region, first=FINER_STEPS))
+            if _walled(content, enough, _block_limits(content, enough, sizes)).lost <= MOST_LOST:
+                return enough
         except InputError:  # more nodes than voxels, or than memory has room for
             return None
-        if finest.lost <= MOST_LOST:
-            return enough
     return None
 
 
