@@ -308,9 +308,11 @@ def runnable(words: list[str]) -> list[str]:
 
 
 def commit() -> str:
-    """The commit that is measured, with `+` where files differ from it."""
-    words = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+", "--exclude=*"]
-    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
+    """The commit that is measured, with `+` where files differ from it, other than those that this script writes."""
+    git, written = ["git", "-C", str(ROOT)], (":!docs/measured", ":!docs/pictures")
+    name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout
+    differs = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ":/", *written]).returncode != 0
+    return name.strip() + "+" * differs
 
 
 def machine() -> str:
