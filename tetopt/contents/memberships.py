@@ -109,9 +109,9 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     labels = checked_labels("labels", labels)
     factors = tuple(factors or (1,) * labels.ndim)
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
-    values, row = np.unique(labels.data, return_inverse=True)
-    values, raw = values.astype(np.int64), row.reshape(labels.shape)
-    start = raw
+    values = np.unique(labels.data)
+    start = raw = np.searchsorted(values, labels.data)  # with `return_inverse`, voxels are sorted, in 12 times the time
+    values = values.astype(np.int64)
     n_voxels = labels.data.size * prod(factors)
     what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:

@@ -109,9 +109,9 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
 
 def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
     """Renumber labels; labels without a new number are unchanged."""
-    present, row = np.unique(labels.data, return_inverse=True)
+    present = np.unique(labels.data)
     new = np.array([numbers.get(label, label) for label in present.astype(np.int64).tolist()], dtype=np.float64)
-    return Image(new[row].reshape(labels.shape), labels.affine)
+    return Image(new[np.searchsorted(present, labels.data)], labels.affine)
 
 
 def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
