@@ -309,7 +309,7 @@ def runnable(words: list[str]) -> list[str]:
 
 def commit() -> str:
     """The commit that is measured, with `+` where files differ from it, other than those that this script writes."""
-    git, written = ["git", "-C", str(ROOT)], (":!docs/measured", ":!docs/pictures")
+    git, written = ["git", "-C", str(ROOT)], (":!docs/measured", ":!docs/pictures", ":!README.md")
     name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout
     differs = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ":/", *written]).returncode != 0
     return name.strip() + "+" * differs
@@ -391,9 +391,12 @@ def head(*titles: str) -> str:
 
 
 def line(title: str, rows: dict[str, Any], names: Sequence[str], path: str, style: str = "f", *digits: int) -> str:
-    """A row of a table: of each of the named rows, the value at a path of keys with slashes between."""
-    values = [reduce(lambda value, key: value[key], path.split("/"), rows[name]) for name in names]
-    return f"| {title} | " + " | ".join(STYLES[style](value, *digits) for value in values) + " |"
+    """A row of a table: of each of the named rows, the value at a path of keys with slashes between.
+
+    A mesh that could not be compressed has empty `errors` and `cond`, and a dash.
+    """
+    values = [reduce(lambda value, key: value and value[key], path.split("/"), rows[name]) for name in names]
+    return f"| {title} | " + " | ".join("–" if value == {} else STYLES[style](value, *digits) for value in values) + " |"
 
 
 def fixed(value: float | None, digits: int = 3) -> str:
