@@ -57,3 +57,8 @@ def n_pieces(surface):
     one, other = np.append(first, first), np.append(second, third)
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(surface.points),) * 2)
     return len(np.unique(connected_components(graph, directed=False)[1][first]))
+
+
+def channels(content):
+    """All channels of a content, (C, *shape)."""
+    return np.stack([content.channel(number) for number in range(content.n_channels)])

@@ -7,15 +7,8 @@ from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
 
 import tetopt
-from tetopt.contents.memberships import (
-    FARTHEST_DISTANCE,
-    finer,
-    finer_affine,
-    labels_at,
-    memberships,
-    near_distance,
-    supersampling,
-)
+from tetopt.contents.memberships import finer, finer_affine, labels_at, memberships, supersampling
+from tetopt.contents.smoothing import FARTHEST_DISTANCE, near_distance
 
 
 def between(members, first, second):

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
+from tetopt.contents import thickness as thickness_module
 from tetopt.contents.memberships import finer, memberships, supersampling
 from tetopt.contents.thickness import _cosine, _Labels, local_thickness
 from tetopt.image import Image
@@ -54,6 +56,43 @@ def test_a_way_that_leaves_the_grid_or_the_region_has_no_angle():
         edges = np.array([2.0, 1.0, 1.0])
         found = _cosine(labels, (1, 2, 3), (0, np.array(step)), np.linalg.norm(step * edges), edges)
         assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((14, 12, 13), (1.0, 1.0, 1.0)), ((10, 9, 12), (1.0, 1.2, 2.0))])
+def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(shape, spacing, monkeypatch):
+    """A way that leaves the grid ends no chord: with its bound in place of it, rounding once made it the shortest."""
+    field = gaussian_filter(np.random.default_rng(1).normal(size=(3, *shape)), (0.0, 1.5, 1.5, 1.5))
+    members = memberships(Image(field.argmax(axis=0).astype(float), np.diag([*spacing, 1.0])))
+    (steps, lengths), edges = thickness_module._rays(np.array(spacing))
+    labels = _Labels(members.partition.astype(np.int16), members.levels, members.channel, np.empty((0,) * 4, np.uint16))
+    monkeypatch.setattr(thickness_module, "_spread_balls", lambda *_: None)
+    chords = local_thickness(members, np.array(spacing), 8.0)
+    for place in np.ndindex(shape):
+        ways = [
+            [_walk(members, place, sign * step, length) for sign in (1, -1)]
+            for step, length in zip(steps, lengths, strict=True)
+        ]
+        d = int(np.argmin(np.sum(ways, axis=1)))
+        size = sum(ways[d])
+        if size < 8.0:
+            up, down = (tuple((sign * steps[d]).tolist()) for sign in (1, -1))
+            forth = _cosine(labels, place, (d, up), lengths[d], edges)
+            size *= 0.5 * (forth + _cosine(labels, place, (-1 - d, down), lengths[d], edges))
+        assert chords[place] == pytest.approx(min(size, 8.0), abs=1e-5)
+
+
+def _walk(members, place, step, length):
+    """The plain twin of `_way`: infinite if the grid ends."""
+    here, way = np.array(place), 0.0
+    while (here + step >= 0).all() and (here + step < members.partition.shape).all():
+        own, other = members.partition[tuple(here)], members.partition[tuple(here + step)]
+        if own != other:
+            one, two = (members.levels[members.channel[row]] for row in (own, other))
+            near = two[tuple(here)] - one[tuple(here)]
+            far = one[tuple(here + step)] - two[tuple(here + step)]
+            return way + length * near / max(near + far, 1e-6)
+        here, way = here + step, way + length
+    return np.inf
 
 
 def test_a_region_ends_labels():

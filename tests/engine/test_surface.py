@@ -5,7 +5,7 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
-from shapes import OBLIQUE, distance, grid, shaped
+from shapes import OBLIQUE, channels, distance, grid, shaped
 
 import tetopt
 from tetopt.contents.content import content
@@ -65,7 +65,7 @@ def hard_E_D(target, mesh):
     owner = cell_of_voxel(target.image, mesh).ravel()
     is_in = owner >= 0
     squares = 0.0
-    for values in target.values.reshape(len(target.values), -1).astype(float):
+    for values in channels(target).reshape(target.n_channels, -1).astype(float):
         count = np.maximum(np.bincount(owner[is_in], minlength=len(mesh.cells)), 1)
         mean = np.bincount(owner[is_in], values[is_in], len(mesh.cells)) / count
         squares += ((values[is_in] - mean[owner[is_in]]) ** 2).sum()

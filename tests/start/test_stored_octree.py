@@ -5,6 +5,7 @@ import sys
 import naive
 import numpy as np
 import pytest
+from shapes import channels as all_channels
 
 import tetopt
 from tetopt.contents.content import Content, content, plain
@@ -130,7 +131,7 @@ def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeyp
     source = plain(content(images, mask=mask))
     channels = channels_of(source)._replace(means=[3.0, -7.0], scale=1.0)
     sums = block_sums(source, channels, np.array(counts))
-    h = np.stack([values - mean for values, mean in zip(source.values, channels.means, strict=True)])
+    h = np.stack([values - mean for values, mean in zip(all_channels(source), channels.means, strict=True)])
     inside = np.ones(shape, dtype=bool) if source.inside is None else source.inside
     for place in np.ndindex(*counts):
         part = tuple(

@@ -68,11 +68,13 @@ class Content(NamedTuple):
     ----------
     image : Image
         The voxels and the first contrast, restricted to the surroundings of the mask and divided if slices are thick.
-    channels : (C, s_0, ..., s_{n-1}) array, optional
-        Values that should be constant in a cell, in one unit, as whole numbers: a channel for each contrast, and
-        channels of the labels. By default the image's intensities.
-    n_contrasts : int
-        Number of leading channels that are images, not labels.
+    contrasts : (I, s_0, ..., s_{n-1}) array, optional
+        Values that should be constant in a cell, in one unit, as whole numbers: a channel for each contrast. By default
+        the image's intensities, which then are the only channel.
+    rows : (s_0, ..., s_{n-1}) int, optional
+        Number of each voxel's label.
+    codes : (L, K) int32, optional
+        Values of the labels in further channels, in the same unit.
     unit : float
         Squared intensity of the image that corresponds to a squared value of 1 in `values`.
     region : Region or None
@@ -92,6 +94,8 @@ class Content(NamedTuple):
     is_flat : bool
         Facets stay flat, so that nodes on a surface lie off it by what facets cut off. False for order 2: curved facets
         cut nothing off, and their corners lie on the surface.
+    squared_spread : float, optional
+        The variance of several channels, or within a region, once it is known: a pass over all voxels of each channel.
 
     Examples
     --------
@@ -103,8 +107,9 @@ class Content(NamedTuple):
     """
 
     image: Image
-    channels: NDArray[np.int32] | None = None
-    n_contrasts: int = 1
+    contrasts: NDArray[np.int32] | None = None
+    rows: NDArray[np.integer] | None = None
+    codes: NDArray[np.int32] | None = None
     unit: float = 1.0
     region: Region | None = None
     continuation: Continuation | None = None
@@ -114,6 +119,7 @@ class Content(NamedTuple):
     whole: Image | None = None
     repeats: tuple[int, ...] = ()
     is_flat: bool = True
+    squared_spread: float | None = None
 
     @property
     def given(self) -> Image:
@@ -138,17 +144,25 @@ class Content(NamedTuple):
     @property
     def is_plain(self) -> bool:
         """True if the image's intensities are the only channel."""
-        return self.channels is None
+        return self.contrasts is None
+
+    @property
+    def n_contrasts(self) -> int:
+        """Number of leading channels that are images, not labels."""
+        return 1 if self.contrasts is None else len(self.contrasts)
 
     @property
     def n_channels(self) -> int:
         """Number of channels."""
-        return 1 if self.channels is None else len(self.channels)
+        return self.n_contrasts + (0 if self.codes is None else len(self.codes))
 
-    @property
-    def values(self) -> NDArray:
-        """All channels, (C, s_0, ..., s_{n-1}), in memory."""
-        return self.image.data[None] if self.channels is None else self.channels
+    def channel(self, number: int, part: tuple[slice, ...] = ()) -> NDArray:
+        """One channel, (s_0, ..., s_{n-1}), or a part of it; those of labels are not kept, which takes less memory."""
+        if self.contrasts is None:
+            return self.image.data[part]
+        if self.rows is None or self.codes is None or number < self.n_contrasts:
+            return self.contrasts[number][part]
+        return self.codes[number - self.n_contrasts][self.rows[part]]
 
     @property
     def inside(self) -> NDArray[np.bool_] | None:
@@ -172,7 +186,9 @@ class Content(NamedTuple):
             return self.statistics.variance
         if self.is_plain and self.region is None:
             return self.image.variance
-        return self.unit * sum(_variance(values, self.region) for values in self.values)
+        if self.squared_spread is not None:
+            return self.squared_spread
+        return self.unit * sum(_variance(self.channel(number), self.region) for number in range(self.n_channels))
 
     @property
     def spread(self) -> Spread:
@@ -193,9 +209,8 @@ class Content(NamedTuple):
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
         inside = None if self.inside is None else undivided(self, self.inside)
-        return float(
-            sum(noise_level(undivided(self, values), inside) ** 2 for values in self.values[: self.n_contrasts])
-        )
+        contrasts = map(self.channel, range(self.n_contrasts))
+        return float(sum(noise_level(undivided(self, values), inside) ** 2 for values in contrasts))
 
 
 def content(
@@ -273,31 +288,36 @@ def content(
         where = "" if mask is None else " in the meshed region"
         raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        return Content(images[0], region=region, continuation=beyond, keeps_components=keep_components, whole=whole)
-    members = None
+        result = Content(images[0], region=region, continuation=beyond, keeps_components=keep_components, whole=whole)
+        return result if region is None else result._replace(squared_spread=result.variance)
+    members, rows, n_rows = None, np.empty(0, dtype=np.int32), 0
     if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
         factors = supersampling(labels.spacing)
         members = memberships(labels, factors)
         if max(factors) > 1:
             images = [finer(image, factors) for image in images]
             region = None if region is None else _finer_region(region, labels, factors)
-        labels = Image(members.labels[members.partition].astype(np.float64), images[0].affine)
+        rows, n_rows = members.partition, len(members.labels)
+    elif labels is not None and label_weight > 0.0:
+        present = np.unique(labels.data)
+        rows, n_rows = np.searchsorted(present, labels.data).astype(np.int32), len(present)
     contrasts = _scaled(images, weights, region)
-    number, codes = np.zeros(images[0].shape, dtype=np.int64), np.zeros((0, 1))
-    if labels is not None and label_weight > 0.0:
-        number, codes = _one_hot(labels.data.astype(np.int64), region)
+    codes = np.zeros((0, 1))
+    if n_rows > 0:
+        rows, codes = _one_hot(rows, n_rows, region)
         codes = np.sqrt(label_weight) * codes
     if len(contrasts) + len(codes) == 0:
         raise InputError("weights: every image or label that varies has weight 0; give at least one a weight above 0")
-    values, scale = _whole_numbers(contrasts, number, codes)
+    values, whole_codes, scale = _whole_numbers(contrasts, images[0].shape, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(
-        images[0], values, len(contrasts), unit / scale**2, region, beyond, keeps_components=keep_components,
-        whole=whole,
+        images[0], values, rows if n_rows > 0 else None, whole_codes, unit / scale**2, region, beyond,
+        keeps_components=keep_components, whole=whole,
     )  # fmt: skip
+    result = result._replace(squared_spread=result.variance)
     if members is None:
         return result
-    channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)
+    channel, value = len(contrasts) + codes.argmax(axis=0), whole_codes.max(axis=0)
     return result._replace(
         smooth=SmoothLabels(members, smooth_interfaces, channel.astype(np.int64), value, keep_volumes)
     )
@@ -325,24 +345,22 @@ def _scaled(images: list[Image], weights: list[float], region: Region | None) ->
 
 
 def _whole_numbers(
-    contrasts: list[NDArray[np.float32]], number: NDArray[np.int64], codes: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], float]:
-    """All channels, (C, *shape), as whole numbers, and their scale.
+    contrasts: list[NDArray[np.float32]], shape: tuple[int, ...], codes: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
+    """The contrasts, (I, *shape), and the values of labels, (L, K), as whole numbers, and their scale.
 
     If possible, their sums of squares along a row fit into 32 bits.
     """
     square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
-    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (number.shape[-1] * (square or 1.0))))  # 0: a single label, alone
+    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (shape[-1] * (square or 1.0))))  # 0: a single label, alone
     # If one voxel or a rare label is much larger than the rest, sums take 64 bits, to keep enough levels.
     steps = [STEPS_PER_SIGMA / float(np.std(data, dtype=np.float64)) for data in contrasts]
     largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
     scale = min(max([fitting, *steps]), 2.0**30 / (largest or 1.0))
-    values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
-    for row, data in zip(values, contrasts, strict=False):
+    values = np.empty((len(contrasts), *shape), dtype=np.int32)
+    for row, data in zip(values, contrasts, strict=True):
         row[:] = np.rint(scale * data)
-    for row, code in zip(values[len(contrasts) :], codes, strict=True):
-        row[:] = np.rint(scale * code).astype(np.int32)[number]
-    return values, scale
+    return values, np.rint(scale * codes).astype(np.int32), scale
 
 
 def undivided(what: Content, values: NDArray) -> NDArray:
@@ -443,16 +461,23 @@ def _check(
     check_weights(len(images), weights, label_weight, smooth_interfaces)
 
 
-def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Channels that distinguish K labels: each voxel's row, and the rows' values in C channels, (C, K).
+def _one_hot(
+    rows: NDArray[np.int32], n_rows: int, region: Region | None
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:  # fmt: skip
+    """Channels that distinguish K labels: each voxel's label, and the labels' values in C channels, (C, K).
 
-    Each label has its value in one channel and 0 in the others. Labels that are nowhere near one another share a
-    channel. The weight of a label's voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small
-    labels are not sacrificed for the surfaces of large ones; the total variance is 1 (0 for one label).
+    `rows` are numbers of the voxels' labels, below `n_rows`, of which K lie in the region. Each label has its value in
+    one channel and 0 in the others. Labels that are nowhere near one another share a channel. The weight of a label's
+    voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small labels are not sacrificed for the
+    surfaces of large ones; the total variance is 1 (0 for one label).
     """
-    present, counts = np.unique(labels if region is None else labels[region.inside], return_counts=True)
-    number, fraction = np.minimum(np.searchsorted(present, labels), len(present) - 1), counts / counts.sum()
-    number[present[number] != labels] = 0  # beyond the region
+    counts = np.bincount((rows if region is None else rows[region.inside]).ravel(), minlength=n_rows)
+    present = np.flatnonzero(counts)
+    if len(present) < n_rows:
+        index = np.zeros(n_rows, dtype=np.int32)  # 0 beyond the region
+        index[present] = np.arange(len(present))
+        rows = index[rows]
+    number, fraction = rows, counts[present] / counts.sum()
     size = fraction ** (-0.5 * RARITY_POWER)
     channel = label_channels(number, len(fraction))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.memberships import FARTHEST_LEVEL, near_distance, smooth_level
+from tetopt.contents.smoothing import FARTHEST_LEVEL, largest_around, near_distance, smooth_level
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 
@@ -35,7 +35,7 @@ class Region(NamedTuple):
 def region_of(mask: Image) -> Region:
     """The region where a mask of values 0 to 1 is 0.5 or more.
 
-    A mask of two values has the smooth surface of a label (`tetopt.contents.memberships.smooth_level`), except where
+    A mask of two values has the smooth surface of a label (`tetopt.contents.smoothing.smooth_level`), except where
     it, or a gap in it, is one voxel thick. A mask of fractions defines its surface between the voxels and keeps it.
     Where the surface is far, the level counts voxels along the axis on which it is farthest.
     """
@@ -56,13 +56,13 @@ def region_of(mask: Image) -> Region:
 def _smoothed(inside: NDArray[np.bool_], raw: NDArray[np.float32]) -> NDArray[np.float32]:
     """The smooth level of a mask, but `raw` around sheets and gaps of one voxel, which smoothing would tear."""
     wide = np.pad(inside, BEYOND_VOXELS, "edge")
-    level = smooth_level(wide, wide, np.zeros(wide.shape, dtype=np.float32), (1,))
+    level = smooth_level(wide, wide, None, (1,))
     is_single = np.zeros(wide.shape, dtype=bool)
     for side in (wide, ~wide):
         is_thick = scipy.ndimage.binary_opening(side, np.ones((2,) * side.ndim))
-        is_single |= side & ~scipy.ndimage.maximum_filter(is_thick, 3)
+        is_single |= side & ~largest_around(is_thick, 1)
     part = (slice(BEYOND_VOXELS, -BEYOND_VOXELS),) * inside.ndim
-    return np.where(scipy.ndimage.maximum_filter(is_single, 3)[part], raw, level[part])
+    return np.where(largest_around(is_single, 1)[part], raw, level[part])
 
 
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -149,7 +149,7 @@ def voxel_components(
     return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
 
 
-def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
+def label_channels(number: NDArray[np.integer], n_labels: int) -> NDArray[np.int64]:
     """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
     shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
     is_in, block = np.zeros((n_labels, int(np.prod(shape))), dtype=bool), np.arange(np.prod(shape)).reshape(shape)

@@ -18,30 +18,20 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.labels import checked_labels, label_channels
+from tetopt.contents.smoothing import FARTHEST_DISTANCE, FARTHEST_LEVEL, NEAR_SURFACE, largest_around, smooth_level
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 
 PARTITION_BYTES = 40.0  # per voxel, in addition to levels: its label, the nearest label, and temporaries
 NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
-FARTHEST_LEVEL = 6.0  # levels are clipped there: nodes that move in steps near an interface need no larger ones
-FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label are irrelevant, more than levels and smoothing use
-FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels, sigma of the Gaussian where a label or gap is thin, and elsewhere
-THIN_REACH = 4.0, 7.0  # voxels from middle to surface of labels too thin for the broad Gaussian, and of thick ones
-VOLUME_SIGMA, VOLUME_BLOCK = (
-    3.0,
-    2,
-)  # least sigma, voxels, of the Gaussian within which volumes are preserved; summed over blocks
-NEAR_SURFACE = 0.05, 0.95  # distance range of voxels next to the surface: below 1, and centres keep their label
-MOST_LIFTED = 1.0  # voxels by which smoothing may change levels farther off: the error of distances to voxels
-LEAST_SLOPE = 0.3  # least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
+LARGE_BOX = 1 << 20  # voxels of a label's box from which its level is computed on all threads
 AGREEMENT_ROUNDS = 8  # with none, ribs of a CT have .77 to .86 of their volume
 AGREEMENT_FRACTION = 0.02  # of a label's volume, whose lack or excess between labels is corrected
 AGREEMENT_STEP = 0.6  # of the missing depth: levels of thin labels are flat, so that a whole step goes too far
 AGREEMENT_REACH = 2  # voxels from a label within which its level is corrected, half of `APART_VOXELS` at most
 AGREEMENT_VOXELS, PLACES_PER_VOXEL = 20_000, 8  # of those near a label, about as many are sampled, at so many places
 PLASTIC_RATIO = 1.2207440846057596  # root of x^4 = x + 1, of Roberts' sequence in three dimensions
-FLOW_STEPS = 4  # more steps do not improve spheres of 3 to 20 voxels or shells of 2 to 6
 ABSENT_DISTANCE = 1e4  # voxels to a label that is absent from a slice
 
 
@@ -51,7 +41,7 @@ class Memberships(NamedTuple):
     labels: NDArray[np.int64]  # (K,) labels present, ascending
     channel: NDArray[np.int64]  # (K,) row of `levels` for each label; labels nowhere near one another share one
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
-    partition: NDArray[np.int64]  # (*shape) row of `labels` with the smallest level at each voxel
+    partition: NDArray[np.int32]  # (*shape) row of `labels` with the smallest level at each voxel
     parts: int = 1  # voxels of this grid per voxel of the labels
 
 
@@ -110,25 +100,30 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     factors = tuple(factors or (1,) * labels.ndim)
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
     values = np.unique(labels.data)
-    start = raw = np.searchsorted(values, labels.data)  # with `return_inverse`, voxels are sorted, in 12 times the time
+    # With `return_inverse`, voxels are sorted, in 12 times the time.
+    start: NDArray[np.integer]
+    start = raw = np.searchsorted(values, labels.data).astype(np.int32)
     values = values.astype(np.int64)
     n_voxels = labels.data.size * prod(factors)
     what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:
         what += f" (after division by {' x '.join(map(str, factors))})"
     check_memory(PARTITION_BYTES * n_voxels, what, NO_ROOM)
-    off = np.zeros(labels.shape, dtype=np.float32)
+    off = None if max(factors) == 1 else np.zeros(labels.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
-        if factor > 1:
+        if off is not None and factor > 1:
             off = np.maximum(np.repeat(off, factor, axis), _off_planes(start, axis, factor))
             start = _between_slices(start, axis, factors)
             raw = np.repeat(raw, factor, axis)
 
     def level_in(row: int, box: tuple[slice, ...]) -> NDArray[np.float32]:
-        return smooth_level(start[box] == row, raw[box] == row, off[box], factors)
+        inside = start[box] == row
+        return smooth_level(
+            inside, inside if raw is start else raw[box] == row, None if off is None else off[box], factors
+        )
 
     members = gathered(values, start, level_in, prod(factors))
-    if off.any():
+    if off is not None and off.any():
         _merge_crumbs(members.levels, members.partition, members.channel, off == 0.0)
     elif len(values) > 2:
         _agree(members)
@@ -159,7 +154,7 @@ def _agree(members: Memberships) -> None:
 
 def _near(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Voxels so near to a label that no other label of its channel has its level there, as bits: boxes overlap."""
-    return np.packbits(scipy.ndimage.maximum_filter(inside, 2 * AGREEMENT_REACH + 1))
+    return np.packbits(largest_around(inside, AGREEMENT_REACH))
 
 
 def _mask_of(bits: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -187,7 +182,7 @@ def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], near:
 
 def gathered(
     values: NDArray[np.int64],
-    start: NDArray[np.int64],
+    start: NDArray[np.integer],
     level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
     parts: int,
 ) -> Memberships:
@@ -208,10 +203,14 @@ def gathered(
     what = f"labels: {len(values)} labels on {start.size} voxels"
     check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * start.size, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
-    smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
+    smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int32)
     boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]
+    sizes = [prod(side.stop - side.start for side in box) for box in boxes]
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        for row, level in enumerate(threads.map(level_in, range(len(values)), boxes)):
+        # Small labels take a thread each, large ones all threads, one after the other, as their temporaries are large.
+        small = {row: threads.submit(level_in, row, boxes[row]) for row, n in enumerate(sizes) if n < LARGE_BOX}
+        for row in range(len(values)):
+            level = small.pop(row).result() if row in small else level_in(row, boxes[row])
             shared, least = levels[channel[row]][boxes[row]], smallest[boxes[row]]
             np.minimum(shared, level, out=shared)
             partition[boxes[row]][level < least] = row
@@ -279,269 +278,6 @@ def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]
     return tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, shape, strict=True))
 
 
-def smooth_level(
-    inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray[np.float32], factors: Sequence[int]
-) -> NDArray[np.float32]:
-    """The smooth level of a label or a mask, (*shape) float32, clipped at `FARTHEST_LEVEL`.
-
-    Smoothing removes stairs like biharmonic flow: 2 G - G^2, with a Gaussian G, preserves planes and quadrics. Each
-    step then corrects volumes and returns voxels next to the surface to their own side, which undoes excessive
-    smoothing. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
-
-    Parameters
-    ----------
-    inside : (*shape) bool
-        Voxels of the label; between slices by shape.
-    raw : (*shape) bool
-        The same with the label of each voxel's slice, whose volume is preserved.
-    off : (*shape) float32
-        Distance of each voxel from the plane of a slice, voxels; 0 between slices with the same label.
-    factors : sequence of int
-        Thickness of a slice along each axis, voxels.
-    """
-    if inside.all():
-        return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
-    within, without = near_distance(inside), near_distance(~inside)
-    level = np.where(inside, 0.5 - within, without - 0.5)
-    low, high = _bounds(level, off)
-    thin, broad = THIN_REACH
-    reach = np.minimum(scipy.ndimage.maximum_filter(within, 13), scipy.ndimage.maximum_filter(without, 13))
-    fraction = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
-    for _ in range(FLOW_STEPS):
-        smooth = _flowed(level, FINE_SIGMA)
-        if fraction.any():
-            smooth += fraction * (_flowed(level, BROAD_SIGMA) - smooth)
-        level = _with_volume(smooth, raw, max(VOLUME_SIGMA, *factors), low, high)
-    if max(factors) == 1:  # once more, between voxel centres: walls of two voxels would be 2 % too thick
-        level = _with_volume(level, raw, max(VOLUME_SIGMA, *factors), low, high, is_exact=True)
-    return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
-
-
-def near_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance to the nearest voxel centre outside, voxels; 0 outside, clipped where it is far.
-
-    Its square is the least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short
-    steps matter, all are tried, in bytes: a tenth of the time of scipy's transform.
-    """
-    assert FARTHEST_DISTANCE**2 + (FARTHEST_DISTANCE - 1) ** 2 < 256
-    square = np.where(inside, np.uint8(FARTHEST_DISTANCE**2), np.uint8(0))
-    for axis in range(square.ndim):
-        before, least = np.moveaxis(square, axis, 0), np.moveaxis(square.copy(), axis, 0)
-        for k in range(1, min(FARTHEST_DISTANCE, len(least))):
-            moved = before + np.uint8(k * k)
-            np.minimum(least[k:], moved[:-k], out=least[k:])
-            np.minimum(least[:-k], moved[k:], out=least[:-k])
-        square = np.moveaxis(least, 0, axis)
-    return np.sqrt(np.arange(FARTHEST_DISTANCE**2 + 1)).astype(np.float32)[square]
-
-
-def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and the largest level of each voxel."""
-    low, high = np.empty_like(raw), np.empty_like(raw)
-    _fill_bounds(low.reshape(-1), high.reshape(-1), raw.reshape(-1), off.reshape(-1))
-    return low, high
-
-
-@njit(cache=True, nogil=True)
-def _fill_bounds(low: NDArray, high: NDArray, raw: NDArray, off: NDArray) -> None:
-    lifted, nearest, farthest = np.float32(MOST_LIFTED), np.float32(NEAR_SURFACE[0]), np.float32(NEAR_SURFACE[1])
-    for v in range(len(raw)):
-        size = abs(raw[v])
-        least = max(size - lifted, nearest) - off[v]
-        most = (farthest if size <= 0.5 else size + lifted) + off[v]
-        low[v], high[v] = (-most, -least) if raw[v] < 0.0 else (least, most)
-
-
-def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    weights = np.exp(-0.5 / (sigma * sigma) * np.arange(int(3.0 * sigma + 0.5) + 1) ** 2)
-    weights /= np.concatenate([weights[:0:-1], weights]).sum()
-    once = _correlated(level, weights)
-    return once + _correlated(level - once, weights)
-
-
-def _correlated(data: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Correlate `data` along each axis with symmetric `weights` (R+1,), from the middle; constant beyond its faces.
-
-    Equal to `scipy.ndimage` to the last bit, but the last axis is done row by row, in a third of the time.
-    """
-    for axis in range(data.ndim - 1):
-        rows = np.ascontiguousarray(data).reshape(prod(data.shape[:axis]), data.shape[axis], -1)
-        data = _correlated_rows(rows, weights).reshape(data.shape)
-    return np.asarray(scipy.ndimage.correlate1d(data, np.concatenate([weights[:0:-1], weights]), -1, mode="nearest"))
-
-
-@njit(cache=True, nogil=True)
-def _correlated_rows(data: NDArray, weights: NDArray) -> NDArray:
-    """Correlate the middle axis of `data` (A, n, B), with sums in float64 and in scipy's order, for all B at once."""
-    result, total = np.empty_like(data), np.empty(data.shape[2])
-    for a in range(data.shape[0]):
-        for i in range(data.shape[1]):
-            here, row = data[a, i], result[a, i]
-            for c in range(len(total)):
-                total[c] = here[c] * weights[0]
-            for j in range(len(weights) - 1, 0, -1):
-                low, high = data[a, max(i - j, 0)], data[a, min(i + j, data.shape[1] - 1)]
-                for c in range(len(total)):
-                    total[c] += (np.float64(low[c]) + np.float64(high[c])) * weights[j]
-            for c in range(len(total)):
-                row[c] = total[c]
-    return result
-
-
-def _with_volume(
-    level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, low: NDArray, high: NDArray,
-    is_exact: bool = False,
-) -> NDArray[np.float32]:  # fmt: skip
-    """Raise or lower the level smoothly, so that it has the label's volume within `sigma`.
-
-    It stays between the levels `low` and `high`. Both passes over the voxels are kernels, which take a third of
-    numpy's time.
-    """
-    whole = (1,) * (3 - level.ndim) + level.shape
-    blocks = [-(-n // VOLUME_BLOCK) for n in whole]
-    missing, area = np.empty(blocks, dtype=np.float32), np.empty(blocks, dtype=np.float32)
-    if is_exact:
-        missing[:], area[:] = 0.0, 0.0
-        _add_between_centres(missing, area, level.reshape(whole), raw.reshape(whole))
-    else:
-        mean = _correlated(level, np.array([0.75, 0.125]))  # over each voxel, with the level linear between centres
-        _fill_block_sums(missing, area, level.reshape(whole), mean.reshape(whole), raw.reshape(whole))
-    missing, area = (_blurred(sums.reshape(sums.shape[3 - level.ndim :]), sigma) for sums in (missing, area))
-    lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), np.float32(0.0))
-    result = np.empty(whole, dtype=np.float32)
-    _fill_lowered(result, level.reshape(whole), lowered.reshape(blocks), low.reshape(whole), high.reshape(whole))
-    return result.reshape(level.shape)
-
-
-def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Sums over blocks, smoothed by a Gaussian of `sigma` voxels."""
-    return scipy.ndimage.gaussian_filter(sums, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill_block_sums(missing: NDArray, area: NDArray, level: NDArray, mean: NDArray, raw: NDArray) -> None:
-    """Sum over blocks the volume that a level lacks compared with its label, and the voxels that its surface crosses.
-
-    The fraction of a voxel inside follows from the level's mean over it and its slope.
-    """
-    lacking, is_near = np.zeros((2, 2, 2), dtype=np.float32), np.zeros((2, 2, 2), dtype=np.float32)
-    half, one = np.float32(0.5), np.float32(1.0)
-    for a in range(missing.shape[0]):
-        for b in range(missing.shape[1]):
-            for c in range(missing.shape[2]):
-                for i in range(2):
-                    for j in range(2):
-                        for k in range(2):
-                            x, y, z = 2 * a + i, 2 * b + j, 2 * c + k
-                            lacking[i, j, k] = is_near[i, j, k] = np.float32(0.0)
-                            if x >= level.shape[0] or y >= level.shape[1] or z >= level.shape[2]:
-                                continue
-                            distance = mean[x, y, z]
-                            if abs(distance) < half:  # as the slope is 1 at most, others are full or empty anyway
-                                distance /= min(max(_slope(level, x, y, z), np.float32(LEAST_SLOPE)), one)
-                                is_near[i, j, k] = np.float32(abs(distance) < half)
-                            filled = min(max(half - distance, np.float32(0.0)), one)
-                            lacking[i, j, k] = np.float32(raw[x, y, z]) - filled
-                missing[a, b, c], area[a, b, c] = _block_sum(lacking), _block_sum(is_near)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_between_centres(missing: NDArray, area: NDArray, level: NDArray, raw: NDArray) -> None:
-    """Add the sums of `_fill_block_sums`, by octants of the cubes of eight voxel centres that the surface crosses.
-
-    Every centre is on its label's side, so other cubes lack nothing. The area counts by what a lower level would fill.
-    """
-    corner, value = np.empty((8, 3), dtype=np.int64), np.empty(8)
-    for i in range(max(level.shape[0] - 1, 1)):
-        for j in range(max(level.shape[1] - 1, 1)):
-            i1, j1 = min(i + 1, level.shape[0] - 1), min(j + 1, level.shape[1] - 1)
-            low, high = _ends(level, i, j, i1, j1, 0)
-            for k in range(max(level.shape[2] - 1, 1)):
-                k1, low_before, high_before = min(k + 1, level.shape[2] - 1), low, high
-                low, high = _ends(level, i, j, i1, j1, k1)
-                if min(low_before, low) > 0.0 or max(high_before, high) < 0.0:
-                    continue
-                for m in range(8):
-                    corner[m, 0] = i1 if m & 4 else i
-                    corner[m, 1] = j1 if m & 2 else j
-                    corner[m, 2] = k1 if m & 1 else k
-                    value[m] = level[corner[m, 0], corner[m, 1], corner[m, 2]]
-                for m in range(8):
-                    x, y, z = corner[m, 0], corner[m, 1], corner[m, 2]
-                    distance, slope = _in_octant(value, m)
-                    filled = min(max(0.5 - distance, 0.0), 1.0)
-                    missing[x // 2, y // 2, z // 2] += 0.125 * (raw[x, y, z] - filled)
-                    area[x // 2, y // 2, z // 2] += 0.25 / slope * (abs(distance) < 0.5)
-
-
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _ends(level: NDArray, i: int, j: int, i1: int, j1: int, k: int) -> tuple[float, float]:
-    """The least and the largest of four levels."""
-    a, b, c, d = level[i, j, k], level[i, j1, k], level[i1, j, k], level[i1, j1, k]
-    return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-
-
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
-def _in_octant(value: NDArray, m: int) -> tuple[float, float]:
-    """Distance of the middle of a cube's octant at corner m to the surface, in its edges, and the level's slope."""
-    level, rise_x, rise_y, rise_z = 0.0, 0.0, 0.0, 0.0
-    for q in range(8):
-        x, y, z = 0.25 + 0.5 * ((q ^ m) & 4 == 0), 0.25 + 0.5 * ((q ^ m) & 2 == 0), 0.25 + 0.5 * ((q ^ m) & 1 == 0)
-        level += x * y * z * value[q]
-        rise_x += y * z * (value[q] if q & 4 else -value[q])
-        rise_y += x * z * (value[q] if q & 2 else -value[q])
-        rise_z += x * y * (value[q] if q & 1 else -value[q])
-    slope = max(np.sqrt(rise_x * rise_x + rise_y * rise_y + rise_z * rise_z), LEAST_SLOPE)
-    return 2.0 * level / slope, slope
-
-
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _block_sum(values: NDArray) -> np.float32:
-    low = (values[0, 0, 0] + values[1, 0, 0]) + (values[0, 1, 0] + values[1, 1, 0])
-    return low + ((values[0, 0, 1] + values[1, 0, 1]) + (values[0, 1, 1] + values[1, 1, 1]))
-
-
-@njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
-def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
-    """Length of the gradient, from the larger one-sided differences, as both sides cancel across a thin sheet."""
-    here, square = level[x, y, z], np.float32(0.0)
-    last = level.shape[0] - 1, level.shape[1] - 1, level.shape[2] - 1
-    for axis in range(3):
-        i, j, k = axis == 0, axis == 1, axis == 2
-        at = x if i else y if j else z
-        low = level[x - i, y - j, z - k] - here if at > 0 else np.float32(0.0)
-        high = level[x + i, y + j, z + k] - here if at < last[axis] else np.float32(0.0)
-        square += max(low * low, high * high)
-    return np.sqrt(square)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill_lowered(result: NDArray, level: NDArray, lowered: NDArray, low: NDArray, high: NDArray) -> None:
-    """Lower a level by values for blocks, linear between their centres, and keep it within bounds."""
-    first, part = np.zeros((3, max(level.shape)), dtype=np.int64), np.zeros((3, max(level.shape)), dtype=np.float32)
-    for axis in range(3):
-        n = lowered.shape[axis]
-        for i in range(level.shape[axis] if level.shape[axis] > 1 else 0):
-            at = min(max((i + 0.5) / VOLUME_BLOCK - 0.5, 0.0), n - 1.0)
-            first[axis, i] = min(int(at), max(n - 2, 0))
-            part[axis, i] = at - first[axis, i]
-    row = np.empty(lowered.shape[2], dtype=np.float32)
-    for x in range(level.shape[0]):
-        a, u = first[0, x], part[0, x]
-        above = min(a + 1, lowered.shape[0] - 1)
-        for y in range(level.shape[1]):
-            b, v = first[1, y], part[1, y]
-            beside = min(b + 1, lowered.shape[1] - 1)
-            for c in range(len(row)):
-                here = lowered[a, b, c] + (lowered[above, b, c] - lowered[a, b, c]) * u
-                there = lowered[a, beside, c] + (lowered[above, beside, c] - lowered[a, beside, c]) * u
-                row[c] = here + (there - here) * v
-            for z in range(level.shape[2]):
-                c = first[2, z]
-                here = row[c] + (row[min(c + 1, len(row) - 1)] - row[c]) * part[2, z]
-                result[x, y, z] = min(max(level[x, y, z] - here, low[x, y, z]), high[x, y, z])
-
-
 def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
     """Values at the centres of voxels divided by `factors` along the axes: linear, constant beyond the outermost."""
     for axis, factor in enumerate(factors):
@@ -556,7 +292,7 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
     return data
 
 
-def _off_planes(number: NDArray[np.int64], axis: int, factor: int) -> NDArray[np.float32]:
+def _off_planes(number: NDArray[np.integer], axis: int, factor: int) -> NDArray[np.float32]:
     """Distance of each divided voxel from its slice's plane, voxels, where slices differ; 0 elsewhere."""
     n = number.shape[axis]
     along = np.arange(n * factor)
@@ -567,7 +303,7 @@ def _off_planes(number: NDArray[np.int64], axis: int, factor: int) -> NDArray[np
 
 
 def _merge_crumbs(
-    levels: NDArray[np.float32], partition: NDArray[np.int64], channel: NDArray[np.int64], is_plane: NDArray[np.bool_]
+    levels: NDArray[np.float32], partition: NDArray[np.integer], channel: NDArray[np.int64], is_plane: NDArray[np.bool_]
 ) -> None:
     """Merge components of a label between slices that reach no slice's plane into the nearest label, in place.
 
@@ -589,7 +325,7 @@ def _merge_crumbs(
         partition[is_crumb] = new
 
 
-def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
+def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
     """Labels on slices divided along one axis, interpolated by shape.
 
     Within a slice a label's level is the signed distance to its outline; between slices it is linear. A component that
@@ -608,7 +344,7 @@ def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]
     length[axis] = ABSENT_DISTANCE
     divided = [factors[axis] if i == axis else 1 for i in range(number.ndim)]
     shape = tuple(n * f for n, f in zip(number.shape, divided, strict=True))
-    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int64)
+    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int32)
     for row, box in enumerate(scipy.ndimage.find_objects(number + 1)):
         margin = tuple(slice(max(s.start - 1, 0), min(s.stop + 1, n)) for s, n in zip(box, number.shape, strict=True))
         fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from typing import NamedTuple
 
 import numba
@@ -22,14 +22,15 @@ from tetopt.contents.memberships import Memberships
 from tetopt.geometry.vectors import cross, dot, minus, row, scaled
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
+from tetopt.system.slabs import over_slabs
 
 THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # percentiles over a label's voxels that describe its thickness
 THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, steps, the labels, and the labels within a region
 CROSSING_BYTES = 2.0  # per voxel and step
 BEYOND_REGION = -1  # stands for a label beyond the region
-SLABS_PER_THREAD = 4  # slabs of the grid per thread, as some take longer than others
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
 COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
+CROSSING_PLANES = 48  # planes of a slab, at least: crossings are kept for those around it, too
 MOST_STEPS = 255  # counted steps within a label
 LEAST_COSINE = 0.75  # between the shortest chord and a normal; smaller at creases, which have no normal
 BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
@@ -76,13 +77,12 @@ def local_thickness(
     check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
     partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
-    no_crossing = np.zeros((0, 1, 1, 1), dtype=np.uint16)
     levels = members.levels.reshape(-1, *whole)
-    return _thickness(partition, levels, members.channel, no_crossing, spacing, most)
+    return _thickness(partition, levels, members.channel, None, spacing, most)
 
 
 def thickness_between(
-    corners: NDArray[np.float64], partition: NDArray[np.int64], spacing: NDArray[np.float64], most: float
+    corners: NDArray[np.float64], partition: NDArray[np.integer], spacing: NDArray[np.float64], most: float
 ) -> NDArray[np.float32]:
     """Local thickness of labels whose surfaces are facets, such as those of a mesh.
 
@@ -109,34 +109,52 @@ def thickness_between(
     """
     shape, n = partition.shape, partition.ndim
     whole = (1,) * (3 - n) + shape
-    (steps, _), edges = _rays(spacing)
-    check_memory(
-        (THICKNESS_BYTES + CROSSING_BYTES * len(steps)) * partition.size, "thickness of labels", "crop the image"
-    )
+    steps = _rays(spacing)[0][0]
+    reach = 2.0 * most / float(min(spacing)) + CROSSING_PLANES  # in how many planes each thread keeps crossings
+    fraction = min(numba.get_num_threads() * reach / whole[3 - n], 1.0)
+    n_bytes = THICKNESS_BYTES + CROSSING_BYTES * len(steps) * fraction
+    check_memory(n_bytes * partition.size, "thickness of labels", "crop the image")
     if n == 2:  # a segment becomes a rectangle across the plane, of two triangles
         flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
         flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and then the second
         corners = np.concatenate([flat[:, :3], flat[:, 1:]])
-    crossing = np.full((len(steps), *whole), NO_CROSSING, dtype=np.uint16)
-    _over_slabs(lambda slab: _fill_crossings(crossing, corners, steps * edges, edges, slab[3 - n], 3 - n), whole, n)
     no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
-    return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), crossing, spacing, most)
+    return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), corners, spacing, most)
 
 
 def _thickness(
-    partition: NDArray[np.int64], levels: NDArray[np.float32], channel: NDArray[np.int64],
-    crossing: NDArray[np.uint16], spacing: NDArray[np.float64], most: float,
+    partition: NDArray[np.integer], levels: NDArray[np.float32], channel: NDArray[np.int64],
+    corners: NDArray[np.float64] | None, spacing: NDArray[np.float64], most: float,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """`local_thickness` of labels by row (-1 beyond the region), between levels or crossings on a 3-D grid."""
-    n = partition.ndim
-    whole = (1,) * (3 - n) + partition.shape
-    labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, crossing)
+    """`local_thickness` of labels by row (-1 beyond the region), between levels or facets' corners on a 3-D grid."""
+    n, axis = partition.ndim, 3 - partition.ndim
+    whole = (1,) * axis + partition.shape
+    labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, np.zeros((0, 1, 1, 1), np.uint16))
     (steps, lengths), edges = _rays(spacing)
     n_steps = _steps_within(labels.partition, min(int(most / lengths.min()) + 1, MOST_STEPS))
     ways = np.cumsum(np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1)
     rays = steps, ways, edges
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
-    _over_slabs(lambda slab: _fill_chords(chord, is_middle, labels, n_steps, rays, most, slab), whole, n)
+    reach = int(most / lengths.min()) + 1
+
+    def fill(slab: tuple[tuple[int, int], ...]) -> None:
+        if corners is None:
+            _fill_chords(chord, is_middle, labels, n_steps, rays, most, slab)
+            return
+        # Crossings are kept as far from the slab as chords reach: 26 bytes a voxel of these planes alone.
+        first, stop = slab[axis]
+        ends = max(first - reach, 0), min(stop + reach, whole[axis])
+        around = (slice(None),) * axis + (slice(*ends),)
+        near = labels._replace(partition=labels.partition[around])
+        crossing = np.full((len(steps), *near.partition.shape), NO_CROSSING, dtype=np.uint16)
+        _fill_crossings(crossing, corners, steps * edges, edges, ends, axis)
+        moved = (*slab[:axis], (first - ends[0], stop - ends[0]), *slab[axis + 1 :])
+        _fill_chords(
+            chord[around], is_middle[around], near._replace(crossing=crossing), n_steps[around], rays, most, moved
+        )
+
+    n_slabs = None if corners is None else max(whole[axis] // CROSSING_PLANES, numba.get_num_threads())
+    _over_slabs(fill, whole, n, n_slabs)
     thickness = chord.copy()
     _over_slabs(lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab), whole, n)
     return thickness.reshape(partition.shape)
@@ -160,13 +178,12 @@ def _steps_within(partition: NDArray[np.int16], most: int) -> NDArray[np.uint8]:
     return n_steps
 
 
-def _over_slabs(fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tuple[int, ...], n: int) -> None:
+def _over_slabs(
+    fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tuple[int, ...], n: int, most: int | None = None
+) -> None:
     """Call a function for each slab of a grid, on all threads; each call writes only to its slab."""
-    ends = np.linspace(0, whole[3 - n], SLABS_PER_THREAD * numba.get_num_threads() + 1).astype(int).tolist()
     box = [(0, size) for size in whole]
-    slabs = [(*box[: 3 - n], ends_of, *box[4 - n :]) for ends_of in itertools.pairwise(ends)]
-    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        list(threads.map(fill, slabs))
+    over_slabs(lambda *ends: fill((*box[: 3 - n], ends, *box[4 - n :])), whole[3 - n], prod(whole), most)
 
 
 def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
@@ -220,7 +237,7 @@ def _way(
     labels: _Labels, place: tuple[int, int, int], direction: tuple[int, tuple[int, int, int]], ways: NDArray, n: int,
     most: float,
 ) -> float:  # fmt: skip
-    """Distance from a voxel's centre to its label's surface along steps, mm; `most` or more if farther.
+    """Distance from a voxel's centre to its label's surface along steps, mm; infinite if the grid ends, or at `most`.
 
     `direction` is its number and its step; steps down have numbers -1 to -D. `ways` has the length of any number of
     steps along each, of which the first `n` stay within the label. It is inlined: a call would take twice as long as
@@ -235,7 +252,7 @@ def _way(
         a, b, c = i + step[0], j + step[1], k + step[2]
         is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
         if not is_in:
-            return most
+            return np.inf
         if partition[a, b, c] < 0:
             return way + 0.5 * length
         other = partition[a, b, c]
@@ -250,7 +267,7 @@ def _way(
             there = levels[channel[own], a, b, c] - levels[channel[other], a, b, c]
             return float(way + length * here / max(here + there, 1e-6))
         i, j, k, way = a, b, c, way + length
-    return way
+    return np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -267,7 +284,7 @@ def _cosine(
     a, b, c = i + step[0], j + step[1], k + step[2]
     while True:
         is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
-        if not is_in or partition[a, b, c] < 0:  # rounding may put a sum of two ways below one that leaves the grid
+        if not is_in or partition[a, b, c] < 0:
             return 1.0
         if partition[a, b, c] != partition[i, j, k]:
             break
@@ -318,17 +335,20 @@ def _fill_crossings(
 ) -> None:
     """Find where triangles first cross the ways (D, 3), mm, up from voxel centres, in a slab across an axis.
 
+    `crossing` has the planes of the slab alone.
     The cosine of the angle between way and normal is stored, too (`_Labels`).
 
     A triangle's height over a place is in lengths of its normal, which is not a unit vector.
     """
     first, last, rise = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(len(ways))
-    lengths = np.sqrt((ways * ways).sum(axis=1))
+    lengths, origin = np.sqrt((ways * ways).sum(axis=1)), np.zeros(3, dtype=np.int64)
+    origin[axis] = ends[0]
     for facet in range(len(corners)):
         a, b, c = row(corners[facet], 0), row(corners[facet], 1), row(corners[facet], 2)
         for d in range(3):
             low, high = min(a[d], b[d], c[d]) / edges[d], max(a[d], b[d], c[d]) / edges[d]
-            first[d], last[d] = max(int(np.ceil(low)) - 1, 0), min(int(np.floor(high)) + 1, crossing.shape[1 + d] - 1)
+            first[d], last[d] = max(int(np.ceil(low)) - 1, 0), int(np.floor(high)) + 1
+            last[d] = min(last[d], crossing.shape[1 + d] - 1 + origin[d])
         first[axis], last[axis] = max(first[axis], ends[0]), min(last[axis], ends[1] - 1)
         u, v = minus(b, a), minus(c, a)
         normal = cross(u, v)
@@ -349,7 +369,8 @@ def _fill_crossings(
                         if _is_within(minus(place, scaled(-t, row(ways, s))), u, v):
                             part = COSINE_STEPS * int((COSINE_STEPS - 2) * t + 0.5)
                             part += int((COSINE_STEPS - 1) * min(abs(rise[s]) / (size * lengths[s]), 1.0) + 0.5)
-                            crossing[s, i, j, k] = min(crossing[s, i, j, k], np.uint16(part))
+                            at = s, i - origin[0], j - origin[1], k - origin[2]
+                            crossing[at] = min(crossing[at], np.uint16(part))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -93,7 +93,7 @@ def unexplained(content: Content, mesh: Mesh) -> float | None:
 
 def _columns(content: Content) -> list[int]:
     """Return the columns of `moment_sums` with the sums of the channels' values."""
-    return [1, *range(3, 2 + len(content.values))]
+    return [1, *range(3, 2 + content.n_channels)]
 
 
 def _channel_sums(content: Content, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -54,10 +54,12 @@ from tetopt.system.kernels import (
     run,
     unit,
 )
+from tetopt.system.slabs import over_slabs
 
 EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends, the error of an edge's cut is far below the remainder to 0.5
 SUM_BYTES = 12.0  # per prefix sum and voxel: 8, and temporary arrays
 ONE_CELL = 1 << 40  # counts one cell in sums of cell numbers from 1; see `_visited`
+OWNER_SLABS = 2  # per thread, in finding the cell of each voxel: each slab looks for its facets
 CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task handles at once
 
 
@@ -246,8 +248,6 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     grid, ticks, sides = sampled
     n_cells, hand = len(mesh.cells), _hand(ticks, mesh.cells)
     low, high, shared = np.full(n_cells, np.inf), np.full(n_cells, -np.inf), np.zeros(6, dtype=np.int64)
-    steps = np.zeros(grid.prefix.shape[:3], dtype=np.int64)
-    rows = steps[..., None]  # without sums only their shape matters: one kind of volume for all images
     # Crossing a facet upwards, a row changes from the cells below to the cells above. The changes of the cells' count
     # and of the sum of their numbers, accumulated along the row, give those of the cells that contain each voxel.
     of_cell, signs = sides.of_cell.ravel(), -hand * sides.sign
@@ -255,15 +255,38 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     # Sums of whole numbers below 2^53 are exact in float64.
     number, count = (np.bincount(of_cell, weights.ravel(), len(sides.nodes)) for weights in (numbers, signs))
     change = number.astype(np.int64) + ONE_CELL * count.astype(np.int64)
-    _scatter_changes(steps, change, ticks, sides.nodes, grid.bits, rows)
+    along = ticks[sides.nodes, 0]
+    bottom, top = along.min(axis=1), along.max(axis=1)
     owner = np.empty(grid.shape, dtype=np.int64)
-    volume = np.zeros(grid.shape, dtype=np.float32) if h is None else h.reshape(grid.shape)
-    shared[0] = _fill_owners(owner, low, high, steps, volume)
+
+    def fill(first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        """Find the owners in some planes, as in a volume of these alone."""
+        is_near = (top >= first << grid.bits) & (bottom <= stop << grid.bits)
+        steps, volume = _volume_of(owner[first:stop], None if h is None else h.reshape(grid.shape)[first:stop])
+        moved = ticks - [first << grid.bits, 0, 0]
+        _scatter_changes(steps, change[is_near], moved, sides.nodes[is_near], grid.bits, steps[..., None])
+        least, most = (low, high) if h is None else (low.copy(), high.copy())
+        return least, most, _fill_owners(owner[first:stop], least, most, steps, volume, h is not None)
+
+    slabs = over_slabs(fill, len(owner), owner.size, OWNER_SLABS * numba.get_num_threads())
+    shared[0] = sum(n_shared for *_, n_shared in slabs)
+    for least, most, _ in slabs:
+        np.minimum(low, least, out=low)
+        np.maximum(high, most, out=high)
     if shared[0] > 0:  # sums of several numbers are meaningless
-        steps[:], owner[:], low[:], high[:] = 0, -1, np.inf, -np.inf
+        steps, volume = _volume_of(owner, None if h is None else h.reshape(grid.shape))
+        owner[:], low[:], high[:] = -1, np.inf, -np.inf
         cells = _Cells(ticks, np.ascontiguousarray(mesh.cells), sides.nodes, sides.of_cell, signs, grid.bits)
-        _visit_cells(owner, low, high, shared, cells, volume, steps, rows)
+        _visit_cells(owner, low, high, shared, cells, volume, steps, steps[..., None])
     return _Visited(owner, low, high, shared)
+
+
+def _volume_of(
+    owner: NDArray[np.int64], h: NDArray[np.floating] | None
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
+    """Steps of 0 along the rows of a volume, whose shape alone matters as prefix sums, and its intensities or 0."""
+    steps = np.zeros((*owner.shape[:2], owner.shape[2] + 1), dtype=np.int64)
+    return steps, np.zeros(owner.shape, dtype=np.float32) if h is None else h
 
 
 def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -383,24 +406,49 @@ def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None
     InputError
         As for `sampling_grid`.
     """
-    grid = sampling_grid(content.image, points, bits)
     if content.is_plain and content.region is None:
-        return grid
-    _check_grid(grid.shape, len(content.values) + 2)
+        return sampling_grid(content.image, points, bits)
+    n_channels, n, region = content.n_channels, content.image.ndim, content.region
+    shape = (1,) * (3 - n) + content.image.shape
+    _check_grid(shape, n_channels + 2)
+    inside = None if region is None else region.inside.reshape(shape)
+
+    def channels(first: int, stop: int) -> list[NDArray]:
+        """All channels in some planes."""
+        part = (slice(first, stop),) if n == 3 else ()
+        return [content.channel(number, part).reshape(-1, *shape[1:]) for number in range(n_channels)]
+
     if content.is_plain:
-        rows, shift, is_short = [], grid.shift, grid.prefix.dtype == np.int32
+        grid = sampling_grid(content.image, points, bits)
+        shift, bits, is_short = grid.shift, grid.bits, grid.prefix.dtype == np.int32
     else:
-        square = sum(values.astype(np.float64) ** 2 for values in content.values)
+        grid, shift = None, 0.0
+        bits = grid_bits(content.image, points) if bits is None else bits
         # No channel's sums are larger than those of the squares of its whole numbers.
-        rows, shift, is_short = [content.values[0], square, *content.values[1:]], 0.0, square.sum(-1).max() < 2**31
-    if content.region is not None:
-        rows.append(np.where(content.region.inside, -1, 1))
-    first = 2 if content.is_plain else 0
-    prefix = np.zeros((*grid.prefix.shape[:3], first + len(rows)), dtype=np.int32 if is_short else np.float64)
-    prefix[..., :first] = grid.prefix[..., :first]
-    for number, values in enumerate(rows, first):
-        np.cumsum(values.reshape(grid.shape), axis=2, out=prefix[:, :, 1:, number], dtype=prefix.dtype)
-    return SamplingGrid(prefix, grid.bits, shift, len(content.values))
+        largest = over_slabs(
+            lambda a, b: _squares(channels(a, b)).sum(axis=-1).max(), shape[0], n_channels * prod(shape)
+        )
+        is_short = max(largest) < 2**31
+    n_sums = (2 if grid is not None else n_channels + 1) + (inside is not None)
+    prefix = np.zeros((*shape[:2], shape[2] + 1, n_sums), dtype=np.int32 if is_short else np.float64)
+
+    def fill(first: int, stop: int) -> None:
+        sums = prefix[first:stop]
+        if grid is not None:
+            sums[..., :2] = grid.prefix[first:stop]
+        part = channels(first, stop) if grid is None else []
+        rows = [part[0], _squares(part), *part[1:]] if grid is None else []
+        rows += [] if inside is None else [np.where(inside[first:stop], np.int8(-1), np.int8(1))]
+        for number, each in enumerate(rows, n_sums - len(rows)):
+            np.cumsum(each, axis=2, out=sums[:, :, 1:, number], dtype=prefix.dtype)
+
+    over_slabs(fill, shape[0], prefix.size)
+    return SamplingGrid(prefix, bits, shift, n_channels)
+
+
+def _squares(values: Sequence[NDArray[np.int32]]) -> NDArray[np.float64]:
+    """Squares of channels, summed over the channels."""
+    return np.asarray(sum(part.astype(np.float64) ** 2 for part in values))
 
 
 def _check_grid(shape: Sequence[int], n_sums: int) -> None:
@@ -809,7 +857,9 @@ def _scatter_changes(steps: Ints3, change: Ints1, ticks: Ints2, nodes: Ints2, bi
 
 
 @entry
-def _fill_owners(owner: Ints3, low: Floats1, high: Floats1, steps: Ints3, volume: Singles3) -> int:
+def _fill_owners(
+    owner: Ints3, low: Floats1, high: Floats1, steps: Ints3, volume: Singles3, has_range: bool
+) -> int:  # fmt: skip
     """Find the cell of each voxel, and each cell's range, from the steps along rows, in half the time of passes.
 
     Also count the voxels in several cells: if there are any, the other results are invalid.
@@ -824,7 +874,7 @@ def _fill_owners(owner: Ints3, low: Floats1, high: Floats1, steps: Ints3, volume
                 owner[i, j, k] = cell
                 if total >= 2 * ONE_CELL:
                     n_shared += 1
-                elif cell >= 0:
+                elif cell >= 0 and has_range:
                     h = float(volume[i, j, k])
                     low[cell], high[cell] = min(low[cell], h), max(high[cell], h)
     return n_shared

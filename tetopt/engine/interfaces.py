@@ -6,6 +6,7 @@ The label of a cell follows from its voxels, tension and topology (`tetopt.engin
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
@@ -26,6 +27,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import entry, unit
+from tetopt.system.slabs import over_slabs
 
 FEWEST_CENTRES = 20  # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
 SAMPLED_FRACTION = 0.5  # of a label's voxels: if samples show less, its centres are counted, too
@@ -82,12 +84,11 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     """
     n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
     owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
-    n_owned, n_of = np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
-    _count_centres(n_owned, n_of, owner, partition)
+    n_owned, n_of, place_centres = _counted(owner, partition, n_cells, n_labels)
     is_sampled = n_owned < FEWEST_CENTRES
     start = np.append(0, np.cumsum(np.where(is_sampled, len(inner), n_owned)))
     entries = np.empty(start[-1], dtype=np.int32)
-    _place_centres(entries, start[:-1].copy(), owner, partition, is_sampled)
+    place_centres(entries, start, is_sampled)
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
     parts = np.array_split(sampled, 1 + len(sampled) // SAMPLED_AT_ONCE)
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
@@ -97,10 +98,12 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their volume are counted.
     each = np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / np.where(is_sampled, len(inner), n_owned)
     first = np.zeros(n_cells + 1, dtype=np.int64)
-    _count_kinds(first, entries, start, n_labels)
+    over_slabs(lambda a, b: _count_kinds(first, entries, start, n_labels, (a, b)), n_cells, len(entries))
     np.cumsum(first, out=first)
     row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
-    _sum_kinds(row, volume, first, entries, start, each, n_labels)
+    over_slabs(
+        lambda a, b: _sum_kinds(row, volume, first, entries, start, each, n_labels, (a, b)), n_cells, len(entries)
+    )
     counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
     # Samples may miss a label of a voxel or two, so its centres count.
     is_unseen = np.bincount(row, volume, n_labels) < SAMPLED_FRACTION * n_of
@@ -115,6 +118,33 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     piece, cell = pieces.piece[holder >= 0], holder[holder >= 0]
     in_cells = scipy.sparse.csr_array((np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), n_cells))
     return Contents(counts, Contacts(voxels.is_apart, is_place[:-1].copy()), in_cells, pieces.label)
+
+
+def _counted(
+    owner: NDArray[np.int64], partition: NDArray[np.int32], n_cells: int, n_labels: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Callable[[NDArray, NDArray, NDArray], None]]:
+    """Voxel centres in each cell, (M,), those of each label in any, (K,), and a function that lists their labels.
+
+    It writes to separate places for each slab of the voxels, as each has its own counts.
+    """
+    slabs = over_slabs(lambda a, b: (a, b), len(owner), len(owner), numba.get_num_threads())
+
+    def count(first: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        n_owned, n_of = np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
+        _count_centres(n_owned, n_of, owner[first:stop], partition[first:stop])
+        return n_owned, n_of
+
+    counts = over_slabs(count, len(owner), len(owner), len(slabs))
+
+    def place(entries: NDArray, start: NDArray, is_sampled: NDArray) -> None:
+        ends = dict(zip(slabs, np.cumsum([start[:-1], *(each for each, _ in counts[:-1])], axis=0), strict=True))
+        over_slabs(
+            lambda a, b: _place_centres(entries, ends[a, b], owner[a:b], partition[a:b], is_sampled),
+            len(owner), len(owner), len(slabs),
+        )  # fmt: skip
+
+    n_owned, n_of = (np.sum(each, axis=0) for each in zip(*counts, strict=True))
+    return n_owned, n_of, place
 
 
 @njit(cache=True, nogil=True)
@@ -136,10 +166,12 @@ def _place_centres(entries: NDArray, end: NDArray, owner: NDArray, partition: ND
 
 
 @njit(cache=True, nogil=True)
-def _count_kinds(first: NDArray, entries: NDArray, start: NDArray, n_labels: int) -> None:
-    """Count the labels present in each cell."""
+def _count_kinds(
+    first: NDArray, entries: NDArray, start: NDArray, n_labels: int, ends: tuple[int, int]
+) -> None:  # fmt: skip
+    """Count the labels present in each of some cells."""
     last = np.full(n_labels, -1, dtype=np.int64)
-    for cell in range(len(start) - 1):
+    for cell in range(*ends):
         for i in range(start[cell], start[cell + 1]):
             if last[entries[i]] != cell:
                 last[entries[i]] = cell
@@ -148,10 +180,11 @@ def _count_kinds(first: NDArray, entries: NDArray, start: NDArray, n_labels: int
 
 @njit(cache=True, nogil=True)
 def _sum_kinds(
-    row: NDArray, volume: NDArray, first: NDArray, entries: NDArray, start: NDArray, each: NDArray, n_labels: int
-) -> None:
+    row: NDArray, volume: NDArray, first: NDArray, entries: NDArray, start: NDArray, each: NDArray, n_labels: int,
+    ends: tuple[int, int],
+) -> None:  # fmt: skip
     total, last = np.zeros(n_labels), np.full(n_labels, -1, dtype=np.int64)
-    for cell in range(len(start) - 1):
+    for cell in range(*ends):
         end = first[cell]
         for i in range(start[cell], start[cell + 1]):
             label = entries[i]

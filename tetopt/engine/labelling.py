@@ -32,6 +32,7 @@ from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
+from tetopt.system.slabs import over_slabs
 
 TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
 # of a label's volume near its surface, the most that tension and mending may take, and that mending may add: with a
@@ -65,6 +66,7 @@ PIECE_SHARE = 0.3  # of the cell that it gets; with .2, fluid has a Dice of .634
 MOST_FILLED = 1.5  # of a label's volume, or a component's: a larger cell does not become its only one
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
+STAR_CELLS = 100  # work per node in a search for faults, in the unit of `over_slabs`
 
 
 class Pieces(NamedTuple):
@@ -308,7 +310,7 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
     dual.bias[:] = best
 
 
-def _components(partition: NDArray[np.int64], n_labels: int, least: int) -> tuple[list[NDArray[np.int64]], Pieces]:
+def _components(partition: NDArray[np.integer], n_labels: int, least: int) -> tuple[list[NDArray[np.int64]], Pieces]:
     """Number of voxels in each face-connected component of each label, descending; and pieces of `least` or more."""
     sizes = [np.empty(0, dtype=np.int64)] * n_labels
     label_of: list[int] = []
@@ -331,7 +333,7 @@ def _components(partition: NDArray[np.int64], n_labels: int, least: int) -> tupl
 
 
 def label_voxels(
-    partition: NDArray[np.int64], spacing: NDArray[np.float64], n_labels: int, parts: int = 1
+    partition: NDArray[np.integer], spacing: NDArray[np.float64], n_labels: int, parts: int = 1
 ) -> LabelVoxels:
     """Components of labels in the voxels of a grid, pairs that share hardly any area, and places where these touch.
 
@@ -747,10 +749,17 @@ def _nonmanifold(
 
     All of them, or those with a node marked near.
     """
-    # The largest possible number; unwritten pages take no memory.
-    faces = np.empty((len(dual.scale) + 6 * len(labels), 3), dtype=np.int64)
     is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
-    faces = faces[: _find_nonmanifold(faces, dual, labels, is_near, _work(dual))].copy()
+    is_around = _around(dual, is_near)
+
+    def find(first: int, stop: int) -> NDArray[np.int64]:
+        # The largest possible number; unwritten pages take no memory.
+        most = stop - first + dual.cells.shape[1] * (dual.star_start[stop] - dual.star_start[first])
+        faces = np.empty((most, 3), dtype=np.int64)
+        count = _find_nonmanifold(faces, dual, labels, is_near, is_around[first:stop], first, _work(dual))
+        return faces[:count].copy()
+
+    faces = np.concatenate(over_slabs(find, len(is_near), STAR_CELLS * int(is_around.sum())))
     return np.ascontiguousarray(faces[:, :2]), faces[:, 2] == 2
 
 
@@ -794,11 +803,16 @@ def _mend_pairs(
 
 
 @entry
-def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, work: _Work) -> int:
-    """Write the rows of `_nonmanifold` and the number of labels that meet there, (F, 3); return their count."""
-    count, is_around = 0, _around(dual, is_near)
-    for a in range(len(is_around)):
-        if not is_around[a]:
+def _find_nonmanifold(
+    faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, is_around: Bools1, start: int, work: _Work
+) -> int:  # fmt: skip
+    """Write the rows of `_nonmanifold` at nodes from `start`, and the number of labels that meet there, (F, 3).
+
+    Of these nodes, those that `is_around` marks are searched. Return the number of rows.
+    """
+    count = 0
+    for a in range(start, start + len(is_around)):
+        if not is_around[a - start]:
             continue
         fault, n_labels = _fault(dual, labels, a, -1, work) if is_near[a] else (0.0, 2)
         if n_labels == 1:
@@ -824,8 +838,8 @@ def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, 
     return count
 
 
-@helper
-def _around(dual: Dual, is_near: NDArray) -> NDArray:
+@entry
+def _around(dual: Dual, is_near: Bools1) -> Bools1:
     """True for each node with a cell that has a node marked near."""
     is_around = np.zeros(len(is_near), dtype=np.bool_)
     for node in range(len(is_near)):

@@ -549,12 +549,12 @@ def _most_frequent(
     return of_cell
 
 
-def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.int64]:
+def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.int32]:
     """Label of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
-    return np.append(of_cell, outside)[owner]
+    return np.append(of_cell, outside).astype(np.int32)[owner]
 
 
-def _voxel_dice(true: NDArray[np.int32], painted: NDArray[np.int64], n_labels: int) -> NDArray[np.float64]:
+def _voxel_dice(true: NDArray[np.int32], painted: NDArray[np.int32], n_labels: int) -> NDArray[np.float64]:
     """Dice of the voxels of each label, (K,), with those that cells give it."""
     one, other, both = (np.bincount(v[v >= 0], minlength=n_labels) for v in (true, painted, true[true == painted]))
     return 2.0 * both / np.maximum(one + other, 1)
@@ -579,7 +579,8 @@ def by_row(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
     """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for `OUTSIDE_LABEL`."""
     values = np.unique(np.concatenate([[0], np.unique(labels[labels >= 0]), of_cell]))
-    rows = np.where(labels >= 0, np.searchsorted(values, labels), OUTSIDE_LABEL).astype(np.int32)
+    rows = np.searchsorted(values, labels).astype(np.int32)
+    rows[labels < 0] = OUTSIDE_LABEL
     return values, rows, np.searchsorted(values, of_cell)
 
 

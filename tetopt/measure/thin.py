@@ -206,12 +206,15 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     values, row = np.unique(of_cell, return_inverse=True)
     pieces, n_pieces = mesh.straight_pieces()
     owner = cell_of_voxel(grid, pieces) // n_pieces
-    rows = np.where(owner >= 0, row[owner], BEYOND_REGION)
+    rows = np.append(row, BEYOND_REGION).astype(np.int32)[owner]
     shared = facets(pieces.cells)
     is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[:, 0].astype(bool)
     corners = (grid.to_index(pieces.points) * spacing)[shared.nodes[is_between]]
     of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values, most)
-    is_right = (owner >= 0) & (members.labels[members.partition] == of_cell[owner])
+    number = np.searchsorted(members.labels, of_cell)
+    is_known = members.labels[np.minimum(number, len(members.labels) - 1)] == of_cell
+    right = np.append(np.where(is_known, number, -1), -1).astype(np.int32)  # of each cell, and outside
+    is_right = members.partition == right[owner]
     is_right &= True if inside is None else inside
     edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)[owner[is_right]]
     label, across = of_cell[owner[is_right]], thick[is_right] / edge
@@ -233,7 +236,7 @@ def _medians(label: NDArray[np.int64], values: NDArray[np.floating]) -> dict[int
 
 
 def _percentiles(
-    thickness: NDArray[np.float32], rows: NDArray[np.int64], values: NDArray[np.int64], most: float
+    thickness: NDArray[np.float32], rows: NDArray[np.integer], values: NDArray[np.int64], most: float
 ) -> dict[int, Thickness]:
     """Percentiles of the thickness at the voxels of each row, by label."""
     percentiles = {}

@@ -53,7 +53,9 @@ def channels_of(content: Content) -> Channels:
         _check_squares(known.scale, content.n_voxels)
         return Channels([known.mean], known.scale, known.scaled_noise, 0.0)
     means, scale, size = [], 0.0, prod(content.image.shape)
-    for values in content.values if content.image.ndim == 3 else content.values[:, None]:
+    for number in range(content.n_channels):
+        values = content.channel(number)
+        values = values if values.ndim == 3 else values[None]
         sums = [row_sums(np.array(plane, dtype=np.float64, order="C")) for plane in values]
         means.append(mean_of(np.stack(sums), size))
         scale = max(scale, *(abs(float(end) - means[-1]) for end in (values.min(), values.max())))
@@ -64,8 +66,8 @@ def channels_of(content: Content) -> Channels:
     inside = None if content.inside is None else undivided(content, content.inside)
     planes = None if inside is None else noise_planes(inside)
     within, noise = None if inside is None else noise_sample(inside, planes), 0.0
-    for channel, values in enumerate(content.values[: content.n_contrasts]):
-        sample = noise_sample(undivided(content, values), planes)
+    for channel in range(content.n_contrasts):
+        sample = noise_sample(undivided(content, content.channel(channel)), planes)
         parts = zip(sample, (None, None) if within is None else within, strict=True)
         scaled = NoiseSample(*(result.scaled(part, channel, mask) for part, mask in parts))
         noise += sampled_noise(scaled, None if within is None else within.near) ** 2
@@ -153,13 +155,13 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
 
 def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
     """Boxes of whole rows, plane by plane, with their voxels (C, P, R, K) and the mask of those inside (P, R, K)."""
-    image, channels, inside = content.image, content.channels, content.inside
+    image, inside = content.image, content.inside
     for box in image.boxes():
         own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)
-        if channels is None:
+        if content.is_plain:
             values = image.read([each.start for each in own], [each.stop for each in own])
         else:
-            values = channels[:, *own]
+            values = np.stack([content.channel(number, own) for number in range(content.n_channels)])
         yield box, values.reshape(-1, *shape), None if inside is None else inside[own].reshape(shape)
 
 

@@ -191,7 +191,7 @@ class Kernel:
     def dispatcher(self) -> Any:
         """The numba dispatcher by which Python calls it."""
         compiled_by = plain_njit if links() is None else njit  # with separate caches: only one has symbols
-        return compiled_by(cache=True, error_model="numpy")(_versioned(self.function))
+        return compiled_by(cache=True, error_model="numpy", nogil=True)(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: links the units that it calls, and lays out records."""

@@ -1,0 +1,39 @@
+"""Work on arrays in slabs along an axis, on all threads; each call writes only to its slab."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numba
+import numpy as np
+
+SLABS_PER_THREAD = 4  # as some take longer than others
+SLAB_ELEMENTS = 1 << 16  # of a slab at least: waking a thread for fewer takes longer than their work
+
+Result = TypeVar("Result")
+
+
+def over_slabs(fill: Callable[[int, int], Result], n: int, n_elements: int, most: int | None = None) -> list[Result]:
+    """Call a function with the first position and the end of each of some slabs, and return its results in order.
+
+    Parameters
+    ----------
+    fill : callable
+        Function of two positions along the axis; called on several threads.
+    n : int
+        Length of the axis.
+    n_elements : int
+        Number of elements of the whole array, which determines the number of slabs.
+    most : int, optional
+        Largest number of slabs; `SLABS_PER_THREAD` for each thread by default.
+    """
+    n_threads = numba.get_num_threads()
+    n_slabs = max(min(most or SLABS_PER_THREAD * n_threads, n_elements // SLAB_ELEMENTS, n), 1)
+    ends = list(itertools.pairwise(np.linspace(0, n, n_slabs + 1).astype(int).tolist()))
+    if n_threads == 1 or n_slabs == 1:
+        return [fill(first, stop) for first, stop in ends]
+    with ThreadPoolExecutor(n_threads) as threads:
+        return list(threads.map(lambda slab: fill(*slab), ends))
