@@ -396,7 +396,8 @@ def line(title: str, rows: dict[str, Any], names: Sequence[str], path: str, styl
     A mesh that could not be compressed has empty `errors` and `cond`, and a dash.
     """
     values = [reduce(lambda value, key: value and value[key], path.split("/"), rows[name]) for name in names]
-    return f"| {title} | " + " | ".join("–" if value == {} else STYLES[style](value, *digits) for value in values) + " |"
+    words = ["–" if value == {} else STYLES[style](value, *digits) for value in values]
+    return f"| {title} | {' | '.join(words)} |"
 
 
 def fixed(value: float | None, digits: int = 3) -> str:

@@ -1,6 +1,7 @@
 """Graded starts: where the nodes are, how many, and the hard cases; and the mesh that comes of them."""
 
 import sys
+import warnings
 
 import numba
 import numpy as np
@@ -286,6 +287,20 @@ def test_a_wall_that_no_octree_keeps_has_the_one_that_loses_least():
     whole = octree_mesh(content, enough)
     assert lost(content, whole) < octree.MOST_LOST
     assert octree.nodes_for_walls(content, whole, enough, None) is None
+
+
+def test_without_room_for_finer_octrees_the_initial_mesh_warns_and_the_search_for_a_number_does_not(monkeypatch):
+    def full(_, what, remedy):
+        if remedy == "use fewer nodes":  # of an octree finer than the first
+            raise tetopt.InputError(f"{what}: expected no more memory than there is; {remedy}")
+
+    content = shell(34, 13.0)
+    monkeypatch.setattr(octree, "check_memory", full)
+    with pytest.warns(UserWarning, match="nodes: expected no more memory .* walls of the mask with fewer nodes"):
+        mesh = octree_mesh(content, 300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert octree.nodes_for_walls(content, mesh, 300, None) is None
 
 
 def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_nodes(monkeypatch):

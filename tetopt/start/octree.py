@@ -274,7 +274,12 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     Where that would lose walls thinner than its cells, it has more nodes, if these keep them or lose at most half as
     much; exchanges remove nodes.
     """
-    return _octree_of_box(content, nodes, limits) if content.region is None else _walled(content, nodes, limits).mesh
+    if content.region is None:
+        return _octree_of_box(content, nodes, limits)
+    walled = _walled(content, nodes, limits)
+    if walled.shortage:
+        warn(f"{walled.shortage}: the initial mesh has walls of the mask with fewer nodes than it would have")
+    return walled.mesh
 
 
 class _Tried(NamedTuple):
@@ -282,16 +287,18 @@ class _Tried(NamedTuple):
 
     mesh: Mesh
     lost: float  # fraction of the mask's volume
+    shortage: str = ""  # what ended the search for one that loses less, if memory or the number of voxels did
 
 
 def _walled(content: Content, nodes: int, limits: _BlockLimits) -> _Tried:
     """`_octree_within` a mask, and what it loses."""
     assert content.region is not None
     tried = _finer_octrees(content, nodes, limits, content.region)
-    first = least = next(tried)
-    for each in tried:
-        least = min(least, each, key=lambda octree: octree.lost)
-    return least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first
+    first = least = last = next(tried)
+    for last in tried:
+        least = min(least, last, key=lambda octree: octree.lost)
+    best = least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first
+    return best._replace(shortage=last.shortage)
 
 
 def _finer_octrees(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Iterator[_Tried]:
@@ -310,7 +317,7 @@ def _finer_octrees(content: Content, nodes: int, limits: _BlockLimits, region: R
         except InputError as error:
             if step == 0:
                 raise
-            warn(f"{error}: the initial mesh has walls of the mask with fewer nodes than it would have")
+            yield _Tried(mesh, np.inf, str(error))  # the mesh before, or one without room
             return
         lost = lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
