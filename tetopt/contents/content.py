@@ -157,7 +157,27 @@ class Content(NamedTuple):
         return self.n_contrasts + (0 if self.codes is None else len(self.codes))
 
     def channel(self, number: int, part: tuple[slice, ...] = ()) -> NDArray:
-        """One channel, (s_0, ..., s_{n-1}), or a part of it; those of labels are not kept, which takes less memory."""
+        """One channel, or a part of it; those of labels are computed, as each would take four bytes a voxel.
+
+        Parameters
+        ----------
+        number : int
+            From 0 to `n_channels` - 1: first the contrasts.
+        part : tuple of slice
+            Part of the voxels; all by default.
+
+        Returns
+        -------
+        (s_0, ..., s_{n-1}) array
+            The values, of int32 unless the image's intensities are the only channel.
+
+        Examples
+        --------
+        >>> phantom = tetopt.load_phantom("sphere")
+        >>> what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
+        >>> [len(np.unique(what.channel(number))) for number in range(what.n_channels)]
+        [10, 2, 2]
+        """
         if self.contrasts is None:
             return self.image.data[part]
         if self.rows is None or self.codes is None or number < self.n_contrasts:
