@@ -56,7 +56,7 @@ class SmoothLabels(NamedTuple):
 
     memberships: Memberships
     tension: float  # voxels an interface would move to reduce its area
-    own_channel: NDArray[np.int64]  # (K,) channel of each label, a row of `values`
+    own_channel: NDArray[np.int64]  # (K,) channel of each label
     own_value: NDArray[np.int32]  # (K,) value of its voxels in that channel
     keeps_volumes: bool  # True if labels thinner than cells keep their volume
 
@@ -76,7 +76,7 @@ class Content(NamedTuple):
     codes : (L, K) int32, optional
         Values of the labels in further channels, in the same unit.
     unit : float
-        Squared intensity of the image that corresponds to a squared value of 1 in `values`.
+        Squared intensity of the image that corresponds to a squared value of 1 in the channels.
     region : Region or None
         The region to cover; None for the image's box.
     continuation : Continuation, optional
@@ -222,12 +222,12 @@ class Content(NamedTuple):
 
     @property
     def wrong_side(self) -> float:
-        """Penalty of a voxel on the wrong side of the region's surface, in squared units of `values`."""
+        """Penalty of a voxel on the wrong side of the region's surface, in squared units of the channels."""
         return WRONG_SIDE_VARIANCES * (self.variance / self.unit or 1.0)
 
     @property
     def noise(self) -> float:
-        """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
+        """Variance of the contrasts' noise, in the unit of the channels; labels have none."""
         inside = None if self.inside is None else undivided(self, self.inside)
         contrasts = map(self.channel, range(self.n_contrasts))
         return float(sum(noise_level(undivided(self, values), inside) ** 2 for values in contrasts))
