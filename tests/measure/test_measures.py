@@ -4,9 +4,14 @@ import time
 from functools import partial
 
 import numba
+import numpy as np
 import pytest
 
-from tetopt.measure.measures import measured_each
+import tetopt
+from tetopt.measure.fidelity import label_fidelity, mask_fidelity
+from tetopt.measure.interfaces import label_interfaces
+from tetopt.measure.measures import fidelity, measured_each
+from tetopt.measure.thin import label_contacts
 
 
 def test_measures_keep_to_the_number_of_threads():
@@ -28,3 +33,34 @@ def test_the_first_error_ends_the_measures(monkeypatch):
     assert begun == []
     assert measured_each(broken | others, failed) == dict.fromkeys(others)
     assert failed["a"].startswith("ZeroDivisionError")
+
+
+def close(one, other):
+    """True if two rows, or lists of rows, have the same numbers but for rounding."""
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(close, one, other))
+    return one is other or np.isclose(one, other, rtol=1e-9, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("shape", [(30, 40, 36), (50, 44)])
+def test_what_lies_far_from_a_mask_counts_for_no_measure(shape):
+    """A mask that reaches one side of the image, a mesh that reaches beyond it, two labels with a loose voxel."""
+    place = np.indices(shape)
+    middle = np.array([0, 14, 16][: len(shape)]).reshape(-1, *[1] * len(shape))
+    far = np.sqrt(((place - middle) ** 2).sum(axis=0))
+    numbers = np.where(place[1] > 14, 2, 1)
+    numbers[(4, 6, 16)[: len(shape)]] = 2
+    affine = np.diag([*(1.1, 0.9, 1.3)[: len(shape)], 1.0])
+    affine[:-1, -1] = 20.0
+    labels, mask = tetopt.Image(numbers, affine), tetopt.Image((far <= 9).astype(float), affine)
+    wide = tetopt.Image((far <= 11).astype(float), affine)
+    result = tetopt.mesh_image(tetopt.content(labels, labels, wide), 250, iterations=3)
+    measured = fidelity(labels, mask, result.mesh, result.labels)
+    rest = result.mesh, result.labels, mask
+    assert close(measured["mask"], mask_fidelity(mask, result.mesh))
+    for row, whole in zip(measured["labels"], label_fidelity(labels, *rest), strict=True):
+        assert close(row[:-4], whole[:-4])
+        assert row.voxels < 0.3 * numbers.size  # the image is larger
+    assert close(measured["interfaces"], label_interfaces(labels, *rest))
+    assert close(measured["contacts"], label_contacts(labels, *rest))
+    assert len(shape) == 2 or any(row.lost_components for row in measured["labels"])

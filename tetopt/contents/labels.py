@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
 from tetopt.image import Image, transformed
 
@@ -156,7 +157,7 @@ def label_channels(number: NDArray[np.integer], n_labels: int) -> NDArray[np.int
     for place in itertools.product(range(APART_VOXELS), repeat=number.ndim):  # the voxels of all blocks in turn
         part = number[tuple(slice(first, None, APART_VOXELS) for first in place)]
         is_in[part, block[tuple(slice(n) for n in part.shape)]] = True
-    is_beside = np.stack([scipy.ndimage.maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
+    is_beside = np.stack([largest_around(row.reshape(shape), 1).ravel() for row in is_in])
     touches = is_beside.astype(np.float32) @ is_in.T.astype(np.float32) > 0.0
     channel = np.full(n_labels, -1, dtype=np.int64)
     for label in np.argsort(-touches.sum(axis=1), kind="stable"):

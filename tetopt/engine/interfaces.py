@@ -6,8 +6,7 @@ The label of a cell follows from its voxels, tension and topology (`tetopt.engin
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -84,17 +83,32 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     """
     n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
     owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
-    n_owned, n_of, place_centres = _counted(owner, partition, n_cells, n_labels)
+
+    def count(first: int, stop: int) -> _Counted:
+        counted = _Counted(first, stop, np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64))
+        _count_centres(counted.n_owned, counted.n_of, owner[first:stop], partition[first:stop])
+        return counted
+
+    counted = over_slabs(count, len(owner), len(owner), numba.get_num_threads())
+    n_owned, n_of = (np.sum(each, axis=0) for each in list(zip(*counted, strict=True))[2:])
     is_sampled = n_owned < FEWEST_CENTRES
     start = np.append(0, np.cumsum(np.where(is_sampled, len(inner), n_owned)))
     entries = np.empty(start[-1], dtype=np.int32)
-    place_centres(entries, start, is_sampled)
+    # Each slab's centres of a cell follow those of the slabs before.
+    places = np.cumsum([start[:-1], *(each.n_owned for each in counted[:-1])], axis=0)
+
+    def place(first: int, stop: int) -> None:
+        for each, at in zip(counted[first:stop], places[first:stop], strict=True):
+            _place_centres(entries, at, owner[each.first : each.stop], partition[each.first : each.stop], is_sampled)
+
+    over_slabs(place, len(counted), len(owner))
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
-    parts = np.array_split(sampled, 1 + len(sampled) // SAMPLED_AT_ONCE)
-    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        rows = threads.map(lambda part: labels_at(members, index, mesh.cells[part], inner), parts)
-        for part, there in zip(parts, rows, strict=True):
-            entries[start[part, None] + np.arange(len(inner))] = there
+
+    def sample(first: int, stop: int) -> None:
+        part = sampled[first:stop]
+        entries[start[part, None] + np.arange(len(inner))] = labels_at(members, index, mesh.cells[part], inner)
+
+    over_slabs(sample, len(sampled), len(inner) * len(sampled), 1 + len(sampled) // SAMPLED_AT_ONCE)
     # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their volume are counted.
     each = np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / np.where(is_sampled, len(inner), n_owned)
     first = np.zeros(n_cells + 1, dtype=np.int64)
@@ -120,31 +134,13 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     return Contents(counts, Contacts(voxels.is_apart, is_place[:-1].copy()), in_cells, pieces.label)
 
 
-def _counted(
-    owner: NDArray[np.int64], partition: NDArray[np.int32], n_cells: int, n_labels: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Callable[[NDArray, NDArray, NDArray], None]]:
-    """Voxel centres in each cell, (M,), those of each label in any, (K,), and a function that lists their labels.
+class _Counted(NamedTuple):
+    """Voxel centres in a slab of the voxels."""
 
-    It writes to separate places for each slab of the voxels, as each has its own counts.
-    """
-    slabs = over_slabs(lambda a, b: (a, b), len(owner), len(owner), numba.get_num_threads())
-
-    def count(first: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        n_owned, n_of = np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
-        _count_centres(n_owned, n_of, owner[first:stop], partition[first:stop])
-        return n_owned, n_of
-
-    counts = over_slabs(count, len(owner), len(owner), len(slabs))
-
-    def place(entries: NDArray, start: NDArray, is_sampled: NDArray) -> None:
-        ends = dict(zip(slabs, np.cumsum([start[:-1], *(each for each, _ in counts[:-1])], axis=0), strict=True))
-        over_slabs(
-            lambda a, b: _place_centres(entries, ends[a, b], owner[a:b], partition[a:b], is_sampled),
-            len(owner), len(owner), len(slabs),
-        )  # fmt: skip
-
-    n_owned, n_of = (np.sum(each, axis=0) for each in zip(*counts, strict=True))
-    return n_owned, n_of, place
+    first: int
+    stop: int
+    n_owned: NDArray[np.int64]  # (M,) in each cell
+    n_of: NDArray[np.int64]  # (K,) of each label in any cell
 
 
 @njit(cache=True, nogil=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from functools import partial
 from typing import Any
 
 import numba
@@ -12,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, content, continued
+from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.thin import contact_totals, label_contacts, label_layers
 from tetopt.mesh import Mesh
+
+AROUND_VOXELS = 2  # around mask and mesh: their surfaces end at no side of this box but the image's own
 
 
 def fidelity(
@@ -33,7 +37,9 @@ def fidelity(
     of these labels, if known.
     """
     measures: dict[str, Callable[[], Any]] = {}
+    whole = partial(_with_levels, what, labels, mask)
     if mask is not None:
+        labels, mask = _around(labels, mask, mesh)
         measures["mask"] = lambda: mask_fidelity(mask, mesh)
     if labels is not None:
 
@@ -42,7 +48,7 @@ def fidelity(
 
         measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask)
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
-            measures["thickness"] = lambda: label_layers(_with_levels(what, labels, mask), mesh, own())
+            measures["thickness"] = lambda: label_layers(whole(), mesh, own())
         measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
     # First and alone: it takes all threads, and the most memory.
@@ -60,9 +66,29 @@ def fidelity(
     return measured
 
 
-def _with_levels(what: Content | None, labels: Image, mask: Image | None) -> Content:
+def _around(labels: Image | None, mask: Image, mesh: Mesh) -> tuple[Image | None, Image]:
+    """Return the part of labels and a mask around the mask and the mesh: no measure counts what is beyond.
+
+    For a brain in its head this is half of the voxels, of the time and of the memory.
+    """
+    if labels is not None and labels.shape != mask.shape:
+        return labels, mask  # an error of the measures
+    inside, index = mask.data >= INSIDE_FRACTION, mask.to_index(mesh.straight_pieces()[0].points)
+    others = [tuple(d for d in range(mask.ndim) if d != axis) for axis in range(mask.ndim)]
+    within = [
+        np.append(np.flatnonzero(inside.any(axis=rest)), along) for rest, along in zip(others, index.T, strict=True)
+    ]
+    start = [max(int(each.min()) - AROUND_VOXELS, 0) for each in within]
+    stop = [min(int(each.max()) + AROUND_VOXELS + 2, size) for each, size in zip(within, mask.shape, strict=True)]
+    return None if labels is None else labels.box(start, stop), mask.box(start, stop)
+
+
+def _with_levels(what: Content | None, labels: Image | None, mask: Image | None) -> Content:
     """Return the content if it has levels of labels, or else create one of the labels alone with levels."""
-    return what if what is not None and what.memberships is not None else content(labels, labels, mask)
+    if what is not None and what.memberships is not None:
+        return what
+    assert labels is not None
+    return content(labels, labels, mask)
 
 
 def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:
