@@ -4,9 +4,10 @@ import json
 import re
 import warnings
 
+import nibabel
 import numpy as np
 import pytest
-from commands import exit_code, numbers_in
+from commands import assert_refused, exit_code, numbers_in
 from results import FOLDER, our_displacement, solved_model
 
 import tetopt
@@ -135,3 +136,58 @@ def test_fem_warns_of_stiff_linear_cells_once_in_the_same_words(tmp_path, capsys
     words = ["--young", "2", "--nu", "0.45", "--load", "compress:2%"]
     assert exit_code("fem", tmp_path / "a.vtu", *words, "-o", tmp_path / "b.vtu") == 0
     assert capsys.readouterr().err.count("linear elements are too stiff") == 1
+
+
+def test_a_displacement_goes_onto_the_voxels_of_an_image(folder, order, capsys):
+    """As NIfTI's vectors along the world's axes, from the mesh's file or straight from the solver's results."""
+    mesh, u = solved_model(order).mesh, our_displacement(order, 1)
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    affine = np.diag([*(1.2 * (high - low) / [7, 6, 5]), 1.0])
+    affine[:3, 3] = low - 0.1 * (high - low)
+    image = tetopt.Image(np.arange(210.0).reshape(7, 6, 5) % 97, affine)
+    tetopt.save_image(folder / "i.nii.gz", image)
+    words = ["convert", folder / "a.vtu", folder / "u.nii.gz", "--results", folder / "a.frd", "--field", "displacement"]
+    assert exit_code(*words, "--like", folder / "i.nii.gz", "--json", folder / "u.json") == 0
+    expected = tetopt.field_on_image(mesh, u, image)
+    file = nibabel.load(folder / "u.nii.gz")
+    assert file.header.get_intent()[0] == "vector"
+    assert file.shape == (7, 6, 5, 1, 3)
+    values = file.get_fdata()[:, :, :, 0]
+    np.testing.assert_allclose(values, expected, rtol=0.0, atol=6e-6 * np.abs(u).max(), equal_nan=True)
+    assert 0 < np.isnan(values).sum() < values.size
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"on {np.isfinite(values[..., 0]).sum()} of 210 voxels" in said
+    assert numbers_in(folder / "u.json")["n_voxels"] == np.isfinite(values[..., 0]).sum()
+    assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", "--results", folder / "a.frd") == 0
+    turned = ["convert", folder / "i.nii.gz", folder / "b.vtu", folder / "t.nii", "--field", "displacement"]
+    assert exit_code(*turned, "--space", "lps", "--outside", "0") == 0
+    lps = nibabel.load(folder / "t.nii").get_fdata()[:, :, :, 0]
+    np.testing.assert_array_equal(lps, np.nan_to_num(values * [-1, -1, 1]))
+    moved = ["convert", folder / "b.vtu", folder / "w.nii.gz", "--field", "displacement", "--warp", folder / "i.nii.gz"]
+    assert exit_code(*moved) == 0
+    found = tetopt.load_image(folder / "w.nii.gz")
+    told = " ".join(capsys.readouterr().out.split())
+    assert ("nearest voxels, as of labels" in told) != ("linear between voxels" in told)
+    is_nearest = "nearest voxels" in told
+    field = tetopt.load_mesh(folder / "b.vtu").point_data["displacement"]
+    again = tetopt.warped_image(mesh, field, image, is_nearest=is_nearest)
+    np.testing.assert_array_equal(found.data, again.data)
+
+
+def test_an_image_of_a_field_needs_the_field_and_the_voxels(folder, order, capfd):
+    tetopt.save_image(folder / "i.nii.gz", tetopt.Image(np.zeros((3, 3, 3)), np.eye(4)))
+    words = ["convert", folder / "a.vtu", folder / "u.nii.gz"]
+    like = ["--like", folder / "i.nii.gz"]
+    assert_refused(capfd, [*words, *like], "which field")
+    assert_refused(
+        capfd, [*words, *like, "--field", "displacment"], 'no field "displacment"; it has .*displacement_step7'
+    )
+    assert_refused(capfd, [*words, "--field", "heat"], "which image")
+    assert_refused(capfd, [*words, *like, "--field", "heat", "--young", "3"], "--young: has no effect")
+    assert_refused(capfd, [*words, "--field", "mean", "--warp", folder / "i.nii.gz"], "displacement of nodes")
+    assert_refused(capfd, ["convert", folder / "a.vtu", folder / "u.inp", *like], "--like: has no effect")
+    far = np.eye(4)
+    far[:3, 3] = 1e4
+    tetopt.save_image(folder / "far.nii.gz", tetopt.Image(np.zeros((3, 3, 3)), far))
+    assert_refused(capfd, [*words, "--field", "heat", "--like", folder / "far.nii.gz"], "no voxel centre is inside")
+    assert not (folder / "u.nii.gz").exists()

@@ -64,6 +64,7 @@ from .model.fields import cell_fields as cell_fields
 from .model.file import MeshFile as MeshFile
 from .model.labels import LabelTable as LabelTable
 from .model.mappings import ByLabel as ByLabel
+from .model.on_image import field_on_image as field_on_image, warped_image as warped_image
 from .model.loads import Load as Load
 from .model.materials import BinningError as BinningError, Materials as Materials
 from .model.model import Model as Model

@@ -12,7 +12,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import nibabel
 import numpy as np
-import pyvista
 from scipy.ndimage import map_coordinates
 
 import tetopt
@@ -27,22 +26,20 @@ solution = tetopt.solve(model)
 fields = tetopt.solution_fields(mesh, solution)
 
 # %%
-# Every voxel lies in exactly one cell, so indexing turns cell values into an image. The mean over a cell's voxels
-# recovers them; cells without voxels take the nearest voxel's value.
+# Every voxel lies in exactly one cell and takes its value. The mean over a cell's voxels recovers it; cells without
+# voxels take the nearest voxel's value.
 
-stress = tetopt.Image(fields.cell_data["von_mises"][tetopt.cell_of_voxel(image, mesh)], image.affine)
+stress = tetopt.Image(tetopt.field_on_image(mesh, fields.cell_data["von_mises"], image), image.affine)
 cells = tetopt.cell_moments(stress, mesh)
 has_voxels = cells.n_voxels > 0
 difference = np.abs(cells.mean - fields.cell_data["von_mises"])[has_voxels].max()
 print(f"stress: off by {difference:.1e} kPa after voxels and back")
 
 # %%
-# Displacements are linear in each cell. pyvista's ``sample`` evaluates them at voxel centres, and nibabel writes them
-# as an image of three volumes.
+# Displacements are evaluated at voxel centres by the cells' shape functions, here linear, and nibabel writes them as an
+# image of three volumes. ``tetopt convert pressed.vtu u.nii.gz --like T1.nii.gz --field displacement`` does both.
 
-grid = mesh.to_pyvista(point_data={"displacement": solution.u})
-centres = image.to_world(np.argwhere(np.ones(image.shape)))
-on_voxels = pyvista.PolyData(centres).sample(grid)["displacement"].reshape(*image.shape, 3)
+on_voxels = tetopt.field_on_image(mesh, solution.u, image)
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "displacement.nii.gz"
     nibabel.save(nibabel.Nifti1Image(on_voxels, image.affine), path)
@@ -57,6 +54,12 @@ back = np.stack([map_coordinates(read[..., axis], index, order=1, mode="nearest"
 is_inside = ((index >= 0) & (index.T <= np.array(image.shape) - 1).T).all(axis=0)  # between voxels' centres
 off_mm = np.linalg.norm(back - solution.u, axis=1)[is_inside].mean()
 print(f"displacement: off by {off_mm:.4f} mm on average, of up to {np.abs(solution.u).max():.1f} mm")
+
+# %%
+# The image moves with the tissue: each voxel of the deformed block takes the value of the place that moved there.
+
+moved = tetopt.warped_image(mesh, solution.u, image)
+print(f"volume of the spheres: {(image.data > 25).sum()} voxels before, {(moved.data > 25).sum()} after")
 
 # %%
 # Stress and displacement on the voxels of the middle slice, with contours of the image.

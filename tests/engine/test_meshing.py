@@ -155,8 +155,7 @@ def test_a_search_by_attempts():
         ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, not kind"),
         ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, not sizes"),
         ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
-        ({"mode": "uniform"}, "give exactly one of nodes and spacing"),
-        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give exactly one of nodes and spacing"),
+        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give only one of nodes and spacing"),
         ({"mode": "start"}, "requires a mesh to start from"),
     ],
 )

@@ -97,3 +97,25 @@ def test_a_pool_of_new_processes_works_after_a_run(tmp_path):
     command = [sys.executable, str(tmp_path / "program.py")]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     assert done.stdout.split("\n")[:2] == ["64", "[64, 125]"]
+
+
+@pytest.mark.parametrize("given", [(), ("labels",), ("labels", "mask")])
+def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
+    """With its defaults: the same mesh and labels, to the last bit."""
+    phantom = tetopt.load_phantom("sphere")
+    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
+    near = np.linalg.norm(np.indices(image.shape).T - (np.array(image.shape) - 1) / 2, axis=-1).T
+    files = {"image": image, "labels": labels, "mask": tetopt.Image(1.0 * (near < 5.2), image.affine)}
+    for name, each in files.items():
+        tetopt.save_image(tmp_path / f"{name}.nii.gz", each)
+    words = [word for name in given for word in (f"--{name}", tmp_path / f"{name}.nii.gz")]
+    code = exit_code("mesh", tmp_path / "image.nii.gz", "-o", tmp_path / "a.vtu", *words)
+    result = tetopt.mesh_image(tetopt.load_image(tmp_path / "image.nii.gz"), **{name: files[name] for name in given})
+    assert (code == 1) == bool(result.violated)
+    written = tetopt.load_mesh(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(result.mesh.points, written.mesh.points)
+    np.testing.assert_array_equal(result.mesh.cells, written.mesh.cells)
+    if given:
+        np.testing.assert_array_equal(result.labels, written.cell_data["label"])
+        with pytest.raises(InputError, match=r"give labels and mask to tetopt\.content"):
+            tetopt.mesh_image(tetopt.content(image, labels), labels=labels)

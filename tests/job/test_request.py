@@ -29,7 +29,8 @@ VALUES = {
     "density": "1000", "average": "hill", "bins": "5:log", "sets": ["A=below:1", "B=below:2"], "written_sets": "all",
     "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
     "space": "lps", "keep_components": True, "free_volumes": True,
-    "cells_across": 1.5, "label_size": "1=2", "merge": "white=2,41; rest=*",
+    "keep_labels": "2,liver", "drop_labels": "0", "cells_across": 1.5, "label_size": "1=2",
+    "merge": "white=2,41; rest=*",
     "tissues": Path("/c1.nii,/c2.nii"), "mask_label": "5,liver", "spacing_mm": "0.5",
 }  # fmt: skip
 

@@ -1,8 +1,12 @@
 """CalculiX's results of our own input files come back onto the mesh, as `tetopt fem` finds them."""
 
+import re
+import shlex
 import shutil
 import subprocess
+from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 from commands import exit_code
@@ -46,3 +50,34 @@ def test_from_image_to_solver_and_back(tmp_path):
     theirs, ours = (tetopt.load_mesh(tmp_path / name).point_data["displacement"] for name in ("b.vtu", "c.vtu"))
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-5 * np.abs(ours).max())
     assert np.abs(ours).max() > 1.5
+
+
+def test_an_organ_is_pressed_and_its_displacement_is_on_the_voxels(tmp_path, monkeypatch):
+    """The four commands of docs/howto/organ.md, as they stand there, on a liver of two balls."""
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "organ.md").read_text(encoding="utf-8")
+    (block,) = (each for each in re.findall(r"```bash\n(.*?)```", page, re.DOTALL) if "ccx" in each)
+    lines = [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
+    assert [words[0] for words in lines] == ["tetopt", "tetopt", "ccx", "tetopt"]
+    place = np.indices((36, 30, 32))
+    near = [np.sqrt(sum((x - c) ** 2 for x, c in zip(place, at, strict=True))) for at in ((14, 14, 14), (22, 15, 17))]
+    seg = np.where(np.minimum(*near) <= 10, 5, np.where(place[2] > 26, 3, 0))
+    affine = np.diag([-2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = 40.0, -70.0, 900.0
+    tetopt.save_image(tmp_path / "seg.nii.gz", tetopt.Image(seg, affine))
+    (tmp_path / "names.csv").write_text("label,name\n3,spleen\n5,liver\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for words in lines:
+        if words[0] == "ccx":
+            run(tmp_path, words[2])
+        else:
+            assert exit_code(*words[1:]) == 0
+    u = nibabel.load("u.nii.gz")
+    values, inside = u.get_fdata()[:, :, :, 0], np.isfinite(u.get_fdata()[:, :, :, 0, 0])
+    np.testing.assert_allclose(u.affine, affine)
+    assert (inside == (seg == 5)).mean() > 0.995
+    z = affine[2, 3] + affine[2, 2] * place[2][inside]
+    height = z.max() - z.min()
+    up, along = values[inside][:, 2], (z - z.min()) / height
+    assert up[along < 0.05].mean() == pytest.approx(0.05 * height, rel=0.15)
+    assert np.abs(up[along > 0.97]).max() < 0.01 * height
+    assert np.corrcoef(up, along)[0, 1] < -0.6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +11,11 @@ from tetopt.cli.options import NumberOptions, mesh_and_image
 from tetopt.cli.solver import print_model
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS, format_of
+from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
-from tetopt.job.options import LabelledPart, Option, SolverOptions
+from tetopt.job.on_image import is_image_name, write_on_image
+from tetopt.job.options import LabelChoice, LabelledPart, Option, SolverOptions, VoxelOptions, given_options
 from tetopt.system.files import checked_output
 
 
@@ -21,7 +24,8 @@ def convert_command(
         list[Path],
         Option(
             "[IMAGE] MESH OUT",
-            f"The mesh, and the file to write: {', '.join(FORMATS)}. An image before them is that of `image`.",
+            f"The mesh, and the file to write: {', '.join(FORMATS)}, or an image: {', '.join(OUTPUT_SUFFIXES)}. An "
+            "image before them is that of `image`.",
             is_argument=True,
         ),
     ],
@@ -34,22 +38,50 @@ def convert_command(
     ] = None,
     *,
     part: LabelledPart,
+    choice: LabelChoice,
     solver: SolverOptions,
+    voxels: VoxelOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Write a mesh for a solver, with materials, named sets and loads, in the format of OUT's suffix."""
+    """Write a mesh for a solver, in the format of OUT's suffix, or a field of it on the voxels of an image."""
     if len(paths) < 2:
         raise InputError(f"expected MESH and OUT, the file to write, got only {paths[0]}")
     mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
-    output = paths[-1]
-    format_of(output)
-    output = checked_output(output, tuple(FORMATS), numbers.force)
+    output, is_image = paths[-1], is_image_name(paths[-1])
+    if not is_image:
+        format_of(output)
+    _check_options(output, voxels if not is_image else None, part, choice, solver)
+    output = checked_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
     numbers.check()
     with listened(_show):
-        converted = convert_file(mesh_path, output, solver=solver, part=part, image=image_path, results=results_path)
+        if is_image:
+            numbers.save(
+                write_on_image(
+                    mesh_path, output, voxels, like=image_path, results=results_path, space=solver.space,
+                    is_registered=part.registered,
+                )
+            )  # fmt: skip
+            return 0
+        converted = convert_file(
+            mesh_path, output, solver=solver, part=part, choice=choice, image=image_path, results=results_path
+        )
     numbers.save(converted.numbers)
     print_model(output, converted.model, converted.options)
     return 0
+
+
+def _check_options(
+    output: Path, voxels: VoxelOptions | None, part: LabelledPart, choice: LabelChoice, solver: SolverOptions
+) -> None:
+    """Raise InputError for an option of images with a mesh's file, which has `voxels`, or the other way round."""
+    if voxels is not None:
+        wrong, what = given_options(voxels), "a mesh's file; name an image, such as field.nii.gz"
+    else:
+        wrong = given_options(replace(part, registered=False)) | given_options(choice)
+        wrong |= given_options(replace(solver, space="ras"))
+        what = "an image, on all voxels of `like`"
+    if wrong:
+        raise InputError(f"--{next(iter(wrong))}: has no effect on {output}, {what}")
 
 
 def _show(event: Event) -> None:

@@ -11,9 +11,10 @@ from tetopt.cli.ending import is_ended, mesh_kept, tell_end
 from tetopt.cli.options import ForceOption
 from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
+from tetopt.engine.loop import DEFAULT_NODES
 from tetopt.io.mni import mni_path
 from tetopt.job.job import Job
-from tetopt.job.options import DEFAULT_NODES, Option, has_model
+from tetopt.job.options import Option, has_model
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary

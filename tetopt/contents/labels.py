@@ -64,13 +64,18 @@ def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
             f"{np.abs(data - whole).max():.2g})"
         )
         labels = Image(whole + 0.0, labels.affine)  # no -0
-    if is_map:
-        _check_map(name, labels.data)
+    if is_map and (words := _grey_words(labels.data)):
+        raise InputError(f"{name}: expected a label image, got {words}, as in a grey image: is it a label image?")
     return labels
 
 
-def _check_map(name: str, data: NDArray[np.floating]) -> None:
-    """Raise InputError for a grey image."""
+def is_label_map(image: Image) -> bool:
+    """Return whether an image's values are labels: whole numbers from 0, and not those of a grey image."""
+    return image.is_whole and image.range[0] >= 0.0 and not _grey_words(image.data)
+
+
+def _grey_words(data: NDArray[np.floating]) -> str:
+    """Return what shows that whole numbers are those of a grey image; empty for labels."""
     n_equal = n_pairs = 0
     for axis in range(data.ndim):
         one, other = _neighbours(data, axis)
@@ -78,16 +83,14 @@ def _check_map(name: str, data: NDArray[np.floating]) -> None:
         n_pairs += int(np.count_nonzero(is_pair))
         n_equal += int(np.count_nonzero(is_pair & (one == other)))
     if n_pairs < LEAST_JUDGED_PAIRS or n_equal >= LEAST_EQUAL_OF_RAMPS * n_pairs:
-        return
+        return ""
     values, place = np.unique(data, return_inverse=True)
     ranks = np.where(data == 0.0, -2, place.reshape(data.shape))  # 0 is next to no other value
     n_by_one = sum(np.count_nonzero(np.abs(np.subtract(*_neighbours(ranks, axis))) == 1) for axis in range(data.ndim))
     is_ramp = n_by_one > MOST_BY_ONE_VALUE * (n_pairs - n_equal)
     if len(values) > MOST_FEW_VALUES and (n_equal < LEAST_EQUAL * n_pairs or is_ramp):
-        raise InputError(
-            f"{name}: expected a label image, got {len(values)} values, of which only {n_equal / n_pairs:.0%} of "
-            "neighbouring voxels share one, as in a grey image: is it a label image?"
-        )
+        return f"{len(values)} values, of which only {n_equal / n_pairs:.0%} of neighbouring voxels share one"
+    return ""
 
 
 def _neighbours(data: NDArray, axis: int) -> tuple[NDArray, NDArray]:

@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
+from tetopt.contents.content import content as make_content
 from tetopt.engine.curving import curved
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
+    DEFAULT_NODES,
     GRADED_ITERATIONS,
     GRADED_K_D,
     QUADRATIC_GRADATION,
@@ -89,6 +91,8 @@ def mesh_image(
     image: Image | Content,
     nodes: int | None = None,
     *,
+    labels: Image | None = None,
+    mask: Image | None = None,
     target_error: float | None = None,
     sizes: Sizes | None = None,
     order: int = 1,
@@ -105,12 +109,15 @@ def mesh_image(
     Parameters
     ----------
     image : Image or Content
-        The intensities h; or a content with several contrasts, labels and a mask that limits the mesh
-        (`tetopt.content`).
+        The intensities h; or a content with several contrasts, weights, labels and a mask (`tetopt.content`).
     nodes : int
-        Number of nodes, for order 2 including mid-edge nodes. A graded mesh meets it (to 1 % for order 2) unless the
-        run is cut short, k_D is 0, cells must be lifted above the minimum dihedral angle, or no more nodes can be
-        removed. Without `nodes` and `target_error`, the number follows from `sizes` with a target everywhere.
+        Number of nodes, for order 2 including mid-edge nodes; by default as for `tetopt mesh`: what `sizes` require, or
+        5000 (500 in 2-D), fewer for a small image. A graded mesh meets it (to 1 % for order 2) unless the run is cut
+        short, k_D is 0, cells must be lifted above the minimum dihedral angle, or no more nodes can be removed.
+    labels : Image
+        Whole numbers from 0 on the same voxels: each cell gets one. 0 is a label like the others.
+    mask : Image
+        0 to 1 on the same voxels: the region to mesh.
     target_error : float
         Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0 to 1. A few runs find
         the required number of nodes. `violated` reports a run that ends above the target.
@@ -150,9 +157,9 @@ def mesh_image(
     Raises
     ------
     InputError
-        As for `optimize` or `optimize_paper`; options that do not apply to the mode; neither or both of `nodes` and
-        `target_error`, or of `nodes` and `spacing`; a number of nodes that exceeds the image's detail (see
-        `octree_mesh`) or the memory; or an error below the image's noise.
+        As for `optimize` or `optimize_paper`; options that do not apply to the mode; both of `nodes` and
+        `target_error`, or of `nodes` and `spacing`; labels or a mask beside a content; a number of nodes that exceeds
+        the image's detail (see `octree_mesh`) or the memory; or an error below the image's noise.
     TypeError
         An unknown option.
 
@@ -182,6 +189,10 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
+    if labels is not None or mask is not None:
+        if isinstance(image, Content):
+            raise InputError("mesh_image: give labels and mask to tetopt.content, or an image instead of a content")
+        image = make_content(image, labels, mask)
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind)
     search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
     for attempt in search:
@@ -228,11 +239,13 @@ class MeshSearch:
         mode = ("graded" if aim.start is None else "start") if aim.mode is None else aim.mode
         _check_names(options, optimize_paper if mode == "paper" else optimize)
         aim = aim._replace(mode=mode)
-        if mode == "graded" and aim.sizes is not None:
-            sizes = with_label_sizes(aim.sizes, content, aim.nodes, aim.order)[0]
-            is_free = aim.nodes is None and aim.target_error is None
-            aim = aim._replace(sizes=sizes, nodes=_nodes_of(content, sizes, aim.order) if is_free else aim.nodes)
         _check_aim(content, aim)
+        if mode == "graded" and aim.sizes is not None:
+            aim = aim._replace(sizes=with_label_sizes(aim.sizes, content, aim.nodes, aim.order)[0])
+        if aim.nodes is None and aim.target_error is None and aim.spacing is None and mode != "start":
+            is_graded = mode == "graded"
+            nodes = default_nodes(content, aim.sizes, aim.order) if is_graded else DEFAULT_NODES[content.image.ndim]
+            aim = aim._replace(nodes=nodes)
         self._options = _with_defaults(mode, options)
         if mode == "graded":
             aim = aim._replace(sizes=sizes_of_order(content, aim.nodes, aim.sizes, aim.order))
@@ -370,12 +383,18 @@ def _check_names(options: dict[str, Any], optimisation: Run) -> None:
             raise TypeError(f"mesh_image() got an unexpected keyword argument {name!r}{hint}")
 
 
-def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
-    """Number of nodes, including mid-edge ones for order 2, if sizes have targets everywhere; else None."""
-    needed, fraction = nodes_of_sizes(content, sizes)
-    if fraction < 1.0:
-        return None
-    return round(needed * (QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0))
+def default_nodes(content: Content, sizes: Sizes | None, order: int) -> int:
+    """Number of nodes, including mid-edge ones for order 2, that targets require, and elsewhere a part of the usual.
+
+    The usual number is `DEFAULT_NODES`, or one per eight voxels of a small image.
+    """
+    n = content.image.ndim
+    many = QUADRATIC_NODES[n] if order == 2 else 1.0
+    corners = float(np.clip(content.n_voxels // 8, 2 ** (n + 2), DEFAULT_NODES[n] / many))
+    if sizes is not None and sizes.has_target:
+        needed, fraction = nodes_of_sizes(content, sizes)
+        corners = needed + (1.0 - fraction) * corners
+    return int(np.rint(many * corners))
 
 
 def with_label_sizes(
@@ -401,10 +420,10 @@ def _check_aim(content: Content, aim: Aim) -> None:
     if unknown := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])
         raise InputError(f"mesh_image: mode {mode!r} takes {takes}, not {unknown[0]}")
-    if mode == "graded" and ("nodes" in names) == ("target_error" in names):
-        raise InputError("mesh_image: give exactly one of nodes and target_error")
-    if mode in ("uniform", "paper") and ("nodes" in names) == ("spacing" in names):
-        raise InputError("mesh_image: give exactly one of nodes and spacing")
+    if mode == "graded" and "nodes" in names and "target_error" in names:
+        raise InputError("mesh_image: give only one of nodes and target_error")
+    if mode in ("uniform", "paper") and "nodes" in names and "spacing" in names:
+        raise InputError("mesh_image: give only one of nodes and spacing")
     if mode == "start" and not names:
         raise InputError("mesh_image: mode 'start' requires a mesh to start from")
     if mode == "paper" and not (content.is_plain and content.region is None):

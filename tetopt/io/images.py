@@ -236,12 +236,23 @@ def save_image(path: str | Path, image: Image) -> None:
     if path.name.lower().endswith(ZARR_SUFFIX):
         save_zarr(path, image, image.data, _for_file(image.data).dtype)
         return
-    affine = np.eye(4)
-    affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
-    affine[: image.ndim, 3] = image.affine[:-1, -1]
+    save_voxels(path, _for_file(image.data), image)
+
+
+def save_voxels(path: Path, values: NDArray, image: Image) -> None:
+    """Write the values (*shape) or vectors (*shape, K) of an image's voxels as NIfTI, like `save_image`, NaN included.
+
+    Vectors are along the fifth axis, with the intent "vector".
+    """
+    n, affine, is_vector = image.ndim, np.eye(4), values.ndim > image.ndim
+    affine[:n, :n] = image.affine[:-1, :-1]
+    affine[:n, 3] = image.affine[:-1, -1]
     kind = nibabel.Nifti1Image if max(image.shape) <= MOST_OF_NIFTI_1 else nibabel.Nifti2Image
-    file = kind(_for_file(image.data), affine)
+    shape = (*image.shape, *(1,) * (4 - n), values.shape[-1]) if is_vector else image.shape
+    file = kind(values.reshape(shape), affine)
     file.header.set_xyzt_units("mm")
+    if is_vector:
+        file.header.set_intent("vector")
     whole = file.to_bytes()
     if path.suffix.lower() == ".gz":
         packed = io.BytesIO()

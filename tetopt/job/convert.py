@@ -17,7 +17,7 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning
-from tetopt.job.inputs import check_part, read_mesh, texts_of, voxels_of
+from tetopt.job.inputs import check_part, listed, read_mesh, texts_of, voxels_of
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
@@ -28,12 +28,13 @@ from tetopt.job.model import (
     with_chosen_sets,
     without_stale_results,
 )
-from tetopt.job.options import LabelledPart, SolverOptions
+from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
-from tetopt.model.file import MATERIAL_FIELDS, MeshFile, without_results
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, with_labels, without_results
+from tetopt.model.labels import kept_labels, labels_of
 from tetopt.model.model import Model
-from tetopt.model.sets import Sets, box_of, box_text, merged_sets
+from tetopt.model.sets import INTERFACE_PREFIX, Sets, box_of, box_text, merged_sets
 from tetopt.report.summary import model_summary, versions
 
 
@@ -46,8 +47,8 @@ class Converted(NamedTuple):
 
 
 def convert_file(
-    mesh: Path, output: Path, *, solver: SolverOptions, part: LabelledPart, image: Path | None = None,
-    results: Path | None = None,
+    mesh: Path, output: Path, *, solver: SolverOptions, part: LabelledPart, choice: LabelChoice = ALL_LABELS,
+    image: Path | None = None, results: Path | None = None,
 ) -> Converted:  # fmt: skip
     """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's suffix.
 
@@ -57,6 +58,8 @@ def convert_file(
     output : Path
     solver : SolverOptions
     part : LabelledPart
+    choice : LabelChoice
+        Labels whose cells are written.
     image : Path, optional
         The source of means and mappings, instead of the mesh's file.
     results : Path, optional
@@ -72,7 +75,7 @@ def convert_file(
     check_part(image, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
-    loaded = without_stale_results(loaded, solver) if results is None else _with_results(loaded, results)
+    loaded = without_stale_results(loaded, solver) if results is None else with_results(loaded, results)
     solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
@@ -81,6 +84,7 @@ def convert_file(
     if not solver.loads and not is_surface:
         solver = replace(solver, loads=loads_of(loaded))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
+    loaded = _of_labels(loaded, choice)
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
     if image is not None and what is not None:
         about = texts_of(loaded, is_other=True) if is_other else about
@@ -99,6 +103,21 @@ def convert_file(
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 
+def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
+    """Return the mesh without the cells of labels that are left out; report it."""
+    if choice == ALL_LABELS:
+        return loaded
+    labels = labels_of(loaded.cell_data, len(loaded.mesh.cells))
+    if labels is None:
+        raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
+    kept = kept_labels(choice.keep_labels, choice.drop_labels, np.unique(labels).tolist(), loaded.label_table.names)
+    part = with_labels(loaded, kept)
+    left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
+    more = f"; their interfaces are sets: {listed(left)}" if left else ""
+    note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")
+    return part
+
+
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
     """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and units are unchanged."""
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
@@ -115,7 +134,7 @@ def _with_straight_edges(loaded: MeshFile) -> MeshFile:
     return loaded._replace(mesh=mesh, cell_data=loaded.cell_data | volumes)
 
 
-def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
+def with_results(loaded: MeshFile, path: Path) -> MeshFile:
     """Return the mesh with a solver's results instead of earlier ones, of the solved order; report the results."""
     results = read_frd(path, loaded.mesh)
     for line in results.notes:

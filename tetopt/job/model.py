@@ -34,12 +34,14 @@ from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, odd_units
 from tetopt.model.sets import (
     BOUNDARY_SET,
+    INTERFACE_PREFIX,
     Box,
     SetRequest,
     Sets,
     check_free_names,
     interface_names,
     label_set_names,
+    names_in,
     parse_set,
     standard_names,
 )
@@ -50,7 +52,6 @@ SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that eve
 # Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the cells.
 MANY_INTERFACES = 24
 SMALL_FRACTION = 0.1  # of the mesh's length: larger displacements are not small, with strains of about 10 %
-INTERFACE_PREFIX = "interface_"  # of names of facet sets between two labels
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with one material per cell (tests/benchmarks)
 
 
@@ -281,8 +282,12 @@ def check_early(
         warnings.simplefilter("ignore", Remark)
         model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
+    known = model.sets
     for request in requests:
-        check_free_names(request, model.sets)
+        check_free_names(request, known)
+        if request.difference and INTERFACE_PREFIX not in request.difference.lower():
+            names_in(request, known)
+        known = Sets(known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells)
     for name in loaded:
         may_come = name.startswith(INTERFACE_PREFIX) and not other_orders(name, model.sets)
         if name and name not in names and not may_come:

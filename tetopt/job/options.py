@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_type_hints
 
 from tetopt.engine.loop import (
+    DEFAULT_NODES,
     GRADED_ITERATIONS,
     GRADED_K_D,
     MIN_DIHEDRAL,
@@ -31,7 +32,6 @@ from tetopt.start.lattice import Kind
 
 Lattice = Literal[Kind, "octree"]
 Method = Literal["fast", "paper"]
-DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; a graded mesh of a small image has fewer
 
 
 class Option(NamedTuple):
@@ -119,11 +119,38 @@ class LabelledPart(MaskedPart):
     ] = None
 
 
-WHOLE_BOX, WHOLE_IMAGE = BoxPart(), MaskedPart()
+@dataclass(frozen=True, kw_only=True)
+class VoxelOptions:
+    """A mesh's field on the voxels of an image, in place of a solver's file."""
+
+    field_name: Annotated[
+        str | None,
+        Option("NAME", "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz).", "field"),
+    ] = None
+    like: Annotated[Path | None, Option("IMAGE", "The image whose voxels get the field.")] = None
+    outside: Annotated[
+        float | None, Option("VALUE", "Value of voxels outside the mesh (default NaN; 0 with `warp`).")
+    ] = None
+    warp: Annotated[
+        Path | None, Option("IMAGE", "Write this image moved by `field`, a displacement; nearest voxels of labels.")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionOptions:
+class LabelChoice:
+    """The labels that stay, by numbers or names."""
+
+    keep_labels: Annotated[
+        str | None, Option("LABEL,...", "Keep only cells of these labels, numbers or names; the rest is left out.")
+    ] = None
+    drop_labels: Annotated[str | None, Option("LABEL,...", "Leave out these labels.")] = None
+
+
+WHOLE_BOX, WHOLE_IMAGE, ALL_LABELS = BoxPart(), MaskedPart(), LabelChoice()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionOptions(LabelChoice):
     """Region to mesh, with its labels and weights."""
 
     mask: Annotated[
@@ -348,7 +375,8 @@ class ModelOptions:
         list[str] | None,
         Option(
             "NAME=...",
-            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
+            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+), or of other "
+            "sets: NAME=A-B, NAME=outer:A-B, NAME=inner:A-B. May be repeated.",
             "set",
         ),
     ] = None

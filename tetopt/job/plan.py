@@ -11,12 +11,13 @@ import numpy as np
 
 from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
-from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
+from tetopt.engine.loop import DEFAULT_NODES, MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import (
     MODE_DEFAULTS,
     QUADRATIC_NODES,
     Mode,
     check_target_error,
+    default_nodes,
     sizes_of_order,
     with_label_sizes,
 )
@@ -28,7 +29,7 @@ from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
-from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
+from tetopt.job.options import JobOptions, Method, stated_part
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
 from tetopt.start.label_sizes import SizesByLabel
@@ -184,7 +185,7 @@ def resolved(job: JobOptions) -> Plan:
                 f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
             )
     completed = _completed(job, mode)
-    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels or job.tissues)
+    is_plain = len(job.images) == 1 and not (has_region(job) or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
         raise InputError("`method` paper: needs one IMAGE and its whole box; leave out mask, labels and other images")
     return Plan(mode, completed, job)
@@ -195,20 +196,28 @@ def changed(job: JobOptions, **values: Any) -> JobOptions:
     return JobOptions(**(vars(job) | values))
 
 
+def has_region(job: JobOptions) -> bool:
+    """Return whether the options leave out a part of the image's box."""
+    return any(each is not None for each in (job.mask, job.background, job.keep_labels, job.drop_labels))
+
+
 def _check_source(job: JobOptions) -> None:
     """Raise InputError for contradictions among the options of mask and labels."""
     if job.mask_label is not None and job.mask is None:
         raise InputError("`mask_label`: needs `mask`")
     if job.mask is not None and job.background is not None:
         raise InputError("`mask` and `background`: give only one of them")
-    if job.keep_components and job.mask is None and job.background is None:
+    if job.keep_components and not has_region(job):
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
+    if job.keep_labels is not None and job.drop_labels is not None:
+        raise InputError("`keep_labels` and `drop_labels`: give only one of them")
     if job.labels is not None and job.tissues is not None:
         raise InputError("`labels` and `tissues`: give only one of them")
     if job.merge is not None and job.labels is None:
         raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
-        for name in ("label_names", "label_weight", "smooth_interfaces", "cells_across", "label_size"):
+        names = ("keep_labels", "drop_labels", "label_names", "label_weight", "smooth_interfaces")
+        for name in (*names, "cells_across", "label_size"):
             if getattr(job, name) is not None and not (name == "label_names" and job.mask_label is not None):
                 raise InputError(f"`{name}`: needs `labels`")
         if job.free_volumes:
@@ -252,7 +261,10 @@ def _mode(job: JobOptions) -> Mode:
         if job.spacing is not None:
             raise InputError("`lattice` octree: has no single spacing; use `nodes` instead of `spacing`")
     if job.start is not None:
-        others = {**numbers, "`lattice`": job.lattice, "`mask`": job.mask, "`background`": job.background}
+        others = {
+            **numbers, "`lattice`": job.lattice, "`mask`": job.mask, "`background`": job.background,
+            "`keep_labels`": job.keep_labels, "`drop_labels`": job.drop_labels,
+        }  # fmt: skip
         others["`uniform`"] = job.uniform or None
         if names := [name for name, value in others.items() if value is not None]:
             raise InputError(f"`start` and {names[0]}: {job.start} already has nodes and a boundary; leave one out")
@@ -301,7 +313,7 @@ def _pictures(job: JobOptions) -> list[Path]:
     if job.figures is None:
         return []
     names = ["slice.png", "rho.png", "energies.png"]
-    names += [] if job.mask is None and job.background is None else ["boundary.png"]
+    names += ["boundary.png"] if has_region(job) else []
     names += [] if job.labels is None and job.tissues is None else ["labels.png"]
     names += ["thumbnail.png"]
     return list(checked_outputs(results_folder(job.figures), names, job.force).values())
@@ -326,27 +338,13 @@ def with_numbers(
     if limits is not None:
         limits, by_label = with_label_sizes(limits, content, nodes, order)
     if not is_counted:
-        nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
+        nodes = default_nodes(content, limits, order)
     limits = sizes_of_order(content, nodes, limits, order)
     longest = job.edge_max
     if longest is None and nodes is not None:
         longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
         longest = longest if longest < np.inf else None
     return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits, by_label
-
-
-def _default_nodes(content: Content, limits: Sizes | None, many: float) -> int:
-    """Return the number of nodes that the targets require, and elsewhere the same fraction of the usual number.
-
-    `many` is the number of all nodes per corner node.
-    """
-    corners = float(
-        np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
-    )
-    if limits is not None and limits.has_target:
-        needed, fraction = nodes_of_sizes(content, limits)
-        corners = needed + (1.0 - fraction) * corners
-    return int(np.rint(many * corners))
 
 
 def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int | None:

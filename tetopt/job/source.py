@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tetopt.contents.align import KEEP_PIECES, background_level, foreground, resample_contrast, resample_labels
 from tetopt.contents.content import Content, content, continued
-from tetopt.contents.domain import mask_text
+from tetopt.contents.domain import INSIDE_FRACTION, mask_text
+from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
@@ -42,7 +43,7 @@ from tetopt.measure.fidelity import cell_labels, unexplained_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import TABLE_TEXT, label_words, table_of_labels, table_words
+from tetopt.model.labels import TABLE_TEXT, kept_labels, label_words, table_of_labels, table_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
 
@@ -143,6 +144,7 @@ def read_source(
         is_auto = options.background == "auto"
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = _foreground(image, level, labels)
+    labels, mask, kept = _chosen(options, labels, mask, table)
     balance = balance_of(options)
     if options.weights is None and is_own:
         whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
@@ -167,6 +169,7 @@ def read_source(
         **({} if options.mask_label is None else {"mask_label": options.mask_label}),
         **({"divided": factors} if max(factors) > 1 else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
+        **({} if kept is None else {"kept_labels": kept}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
     about = {
@@ -178,6 +181,23 @@ def read_source(
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+def _chosen(
+    options: SourceOptions, labels: Image | None, mask: Image | None, table: LabelTable
+) -> tuple[Image | None, Image | None, list[int] | None]:  # fmt: skip
+    """Return the labels that stay and the mask of their voxels, within another mask; and their numbers, if chosen."""
+    if options.keep_labels is None and options.drop_labels is None:
+        return labels, mask, None
+    assert labels is not None, "the plan requires labels"
+    present = np.unique(labels.data).astype(np.int64).tolist()
+    kept = kept_labels(options.keep_labels, options.drop_labels, present, table.names)
+    is_kept = np.isin(labels.data, kept)
+    if not (is_kept if mask is None else is_kept & (mask.data >= INSIDE_FRACTION)).any():
+        raise InputError("`keep_labels`, `drop_labels`: no voxel would be left within the mask")
+    mask = Image(is_kept if mask is None else np.where(is_kept, mask.data, 0.0), labels.affine)
+    # Those left out on purpose are not reported as missing.
+    return Image(np.where(is_kept, labels.data, BACKGROUND_LABEL), labels.affine), mask, kept
 
 
 def _foreground(image: Image, level: float, labels: Image | None) -> Image:

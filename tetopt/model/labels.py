@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,6 +90,33 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
     first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")
     hint = f"did you mean {' or '.join(near)}?" if near else f"known names are {first}"
     raise InputError(f'label "{text}": no label has this name; {hint}')
+
+
+def kept_labels(keep: str | None, drop: str | None, present: Sequence[int], names: Mapping[int, str]) -> list[int]:
+    """Return the labels, of those present, that stay: those of a text "2,liver", and none of a second one.
+
+    Raises
+    ------
+    InputError
+        Not exactly one text; a label that is not present, or has no such name; none or all labels would stay.
+    """
+    option, text = ("keep_labels", keep) if keep is not None else ("drop_labels", drop)
+    if text is None or (keep is not None and drop is not None):
+        raise InputError("`keep_labels` and `drop_labels`: give only one of them")
+    chosen: set[int] = set()
+    for word in text.split(","):
+        try:
+            labels = labels_named(word, names)
+        except InputError as error:
+            raise InputError(f"`{option}`: {error}") from error
+        if not chosen.union(labels) & set(present).intersection(labels):
+            listed = ", ".join(label_words(label, names) for label in present[:8]) + ", ..." * (len(present) > 8)
+            raise InputError(f'`{option}`: there is no label "{word.strip()}"; there are {listed}')
+        chosen |= set(labels)
+    kept = [label for label in present if (label in chosen) == (keep is not None)]
+    if not kept:
+        raise InputError(f"`{option}`: no label would be left of {', '.join(map(str, present[:8]))}")
+    return kept
 
 
 def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
 from tetopt.geometry.simplex import area_normals, outward_facet_nodes
-from tetopt.geometry.topology import facets, largest_component
+from tetopt.geometry.topology import facets, largest_component, linked
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
@@ -31,6 +31,8 @@ FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
 }
 MOST_LETTERS = 72  # in a name: enough for an interface of two long names; Abaqus and CalculiX allow 80
+INTERFACE_PREFIX = "interface_"  # of names of facet sets between two labels
+SIDE_KINDS = ("outer", "inner")  # of a difference of sets
 SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")  # names that all formats support
 # Names that labels must not have: those of other labels, interfaces, and names that formats use themselves.
 RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cells", re.IGNORECASE)
@@ -320,6 +322,8 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArra
         "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), and
         the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets
         with all nodes within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
+        "NAME=A-B-C", the facets of set A that are in no other of these, and "NAME=outer:A-B", "NAME=inner:A-B", its
+        outer or inner connected parts (`_is_inner`). "interface_b_a" is "interface_a_b" seen from b.
     mean : (M,) float64, optional
         Mean intensity of each cell.
 
@@ -331,7 +335,9 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArra
     for text in requests:
         request = parse_set(text, mesh.ndim)
         check_free_names(request, sets)
-        if request.kind == "below":
+        if request.difference:
+            sets = Sets(sets.facets | {request.name: _of_sets(mesh, request, sets)}, sets.cells)
+        elif request.kind == "below":
             cells = _cells_below(mesh, request, mean)
             surface = {f"{request.name}_surface": enclosing_facets(mesh, cells)}
             sets = Sets(sets.facets | surface, sets.cells | {request.name: cells})
@@ -346,6 +352,7 @@ class SetRequest(NamedTuple):
     name: str
     kind: str
     vectors: list[NDArray[np.float64]]  # the numbers between the colons
+    difference: str = ""  # "A-B-C", of sets of facets
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the sets that it creates."""
@@ -363,12 +370,18 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     name, equals, what = text.partition("=")
     kind, _, rest = what.partition(":")
     shapes = {"below": ("T", [1]), "point": ("X,Y,Z:D", [ndim, 1]), "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1])}
-    if not equals or kind not in shapes:
-        raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
+    is_difference = kind in SIDE_KINDS or (":" not in what and what.strip("- ") != "")
+    if not equals or not (kind in shapes or is_difference):
+        raise InputError(
+            "set: expected NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D, NAME=A-B, NAME=outer:A-B or "
+            f'NAME=inner:A-B of sets A, B, ..., got "{text}"'
+        )
     if not SET_NAME.fullmatch(name):
         raise InputError(
             f'set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, got "{name}"'
         )
+    if is_difference:
+        return SetRequest(name, kind if kind in SIDE_KINDS else "", [], rest if kind in SIDE_KINDS else what)
     form, counts = shapes[kind]
     parts = rest.split(":")
     if len(parts) != len(counts):
@@ -386,6 +399,88 @@ def enclosing_facets(mesh: Mesh, cells: NDArray[np.int64]) -> NDArray[np.int64]:
     part = Mesh(mesh.points, mesh.cells[cells])
     rows = boundary_rows(part)
     return np.column_stack([cells[rows[:, 0]], rows[:, 1]])
+
+
+def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
+    """Return the facets (K, 2) of a difference of sets, or of its outer or inner parts."""
+    first, *others = (_facets_named(mesh, name, request, sets) for name in names_in(request, sets))
+    n_local = mesh.ndim + 1
+    gone = np.concatenate([rows[:, 0] * n_local + rows[:, 1] for rows in [np.empty((0, 2), dtype=np.int64), *others]])
+    rows = first[~np.isin(first[:, 0] * n_local + first[:, 1], gone)]
+    if request.kind and len(rows):
+        rows = rows[_is_inner(mesh, rows) == (request.kind == "inner")]
+    if len(rows) == 0:
+        raise InputError(f"set {request.name}: {request.kind or 'the difference'} {request.difference} has no facet")
+    return rows
+
+
+def names_in(request: SetRequest, sets: Sets) -> list[str]:
+    """Return the names in "A-B-C"; as a name may contain "-", the longest known ones."""
+    parts, names = request.difference.split("-"), []
+    while parts:
+        known = (k for k in range(len(parts), 0, -1) if _place_of("-".join(parts[:k]).strip(), sets) is not None)
+        if (k := next(known, None)) is None:
+            raise InputError(
+                f'set {request.name}: no set of facets begins "{"-".join(parts).strip()}"; the mesh has '
+                f"{', '.join(sets.facets)}"
+            )
+        names.append("-".join(parts[:k]).strip())
+        parts = parts[k:]
+    return names
+
+
+def _place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
+    """Return the set of facets of this name, in any case, and whether it names its labels in the other order."""
+    for known in sets.facets:
+        if known.lower() == name.lower():
+            return known, False
+    for known in sets.facets:
+        if known.startswith(INTERFACE_PREFIX) and name.lower() in map(str.lower, _turned_names(known)):
+            return known, True
+    return None
+
+
+def _turned_names(name: str) -> list[str]:
+    """Return the names "interface_b_a" of an interface "interface_a_b", whose labels' names may contain "_"."""
+    parts = name.removeprefix(INTERFACE_PREFIX).split("_")
+    return [f"{INTERFACE_PREFIX}{'_'.join([*parts[k:], *parts[:k]])}" for k in range(1, len(parts))]
+
+
+def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
+    place = _place_of(name, sets)
+    assert place is not None, f"{request.name}: {name} is split by known names"
+    rows = sets.facets[place[0]]
+    return rows_of(mesh, facet_triples(mesh.cells, rows)[:, ::-1]) if place[1] else rows
+
+
+def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which facets (K, 2) belong to an inner part: parts are linked by edges (in 2-D by nodes).
+
+    A closed part is inner if it faces a void, as its cells lie around it. An open part, such as the wall of a tube
+    whose ends are other sets, is inner if the box around it lies in that of another part.
+    """
+    nodes = facet_triples(mesh.cells, rows)
+    n, sides = mesh.ndim, [np.sort(np.delete(nodes, k, axis=1), axis=1) for k in range(mesh.ndim)]
+    _, of_side = np.unique(np.concatenate(sides), axis=0, return_inverse=True)
+    of_side = of_side.reshape(n, -1).T
+    order = np.argsort(of_side.ravel(), kind="stable")
+    facet, side = order // n, of_side.ravel()[order]
+    is_same = side[1:] == side[:-1]
+    n_parts, part = linked(facet[:-1][is_same], facet[1:][is_same], len(rows))
+    is_open = np.zeros(n_parts, dtype=bool)
+    is_open[part[facet[np.bincount(side)[side] == 1]]] = True
+    corners, middle = mesh.points[nodes], mesh.points.mean(axis=0)
+    flux = ((corners.mean(axis=1) - middle) * area_vectors(mesh, rows)).sum(axis=1)
+    inner = np.bincount(part, flux, n_parts) < 0.0
+    low, high = np.full((n_parts, n), np.inf), np.full((n_parts, n), -np.inf)
+    np.minimum.at(low, part, corners.min(axis=1))
+    np.maximum.at(high, part, corners.max(axis=1))
+    within = ON_SIDE_VOXELS * (high - low).max()
+    size = (high - low).prod(axis=1)
+    for k in np.flatnonzero(is_open):
+        holds = (low <= low[k] + within).all(axis=1) & (high >= high[k] - within).all(axis=1)
+        inner[k] = bool((holds & (size > size[k])).any())
+    return inner[part]
 
 
 def check_free_names(request: SetRequest, sets: Sets) -> None:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+from tetopt.engine.loop import DEFAULT_NODES
 from tetopt.errors import InputError
-from tetopt.job.options import AVERAGE_OPTION, DEFAULT_NODES, WHOLE_BOX, BoxPart, LabelNamesOption, Option
+from tetopt.job.options import AVERAGE_OPTION, WHOLE_BOX, BoxPart, LabelNamesOption, Option
 from tetopt.model.averages import parse_average
 from tetopt.study.compare_report import Settings
 from tetopt.study.pipelines import PIPELINES

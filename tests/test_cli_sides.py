@@ -1,0 +1,162 @@
+"""Walls of vessels and hearts as sets, and labels left out before and after meshing: areas against closed forms."""
+
+import numpy as np
+import pytest
+from commands import assert_refused, exit_code, numbers_in
+
+import tetopt
+from tetopt.geometry.quadratic import of_order, quadratic
+from tetopt.model.sets import area_vectors, boundary_rows, facet_triples
+
+RADII, HALF_LENGTH = (7.0, 11.0), 16.0  # of a tube, mm; its ends are faces of the box
+BLOOD, WALL = 2, 1
+
+
+def area(loaded, name):
+    return float(np.linalg.norm(area_vectors(loaded.mesh, loaded.sets.facets[name]), axis=1).sum())
+
+
+def inward(loaded, name, middle):
+    """Fraction of a set's area that faces a line or place."""
+    rows = loaded.sets.facets[name]
+    vectors = area_vectors(loaded.mesh, rows)
+    towards = middle - loaded.mesh.points[facet_triples(loaded.mesh.cells, rows)].mean(axis=1)
+    towards[:, 2] *= 0.0
+    return float(np.mean((vectors * towards).sum(axis=1) > 0.0))
+
+
+@pytest.fixture(scope="module")
+def vessel(tmp_path_factory):
+    """A tube of blood in its wall along z, as labels and meshed without the rest."""
+    folder = tmp_path_factory.mktemp("vessel")
+    x, y, _ = np.indices((26, 26, 32)) - np.array([12.5, 12.5, 15.5]).reshape(3, 1, 1, 1)
+    far = np.hypot(x, y)
+    labels = np.where(far <= RADII[0], BLOOD, np.where(far <= RADII[1], WALL, 0))
+    affine = np.eye(4)
+    affine[:3, 3] = -12.5, -12.5, -15.5
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels, affine))
+    (folder / "names.csv").write_text("label,name\n1,wall\n2,blood\n", encoding="utf-8")
+    words = ["mesh", folder / "l.nii.gz", "-o", folder / "v.vtu", "--labels", folder / "l.nii.gz", "--nodes", "1500"]
+    words += ["--label-names", folder / "names.csv", "--drop-labels", "0", "--json", folder / "v.json"]
+    assert exit_code(*words) in (0, 1)
+    return folder
+
+
+def test_the_wall_of_a_vessel_without_its_ends(vessel):
+    """Inlet and outlet are planes; what is left of the boundary is the wall, and that of the wall alone two walls."""
+    ends = ["--set", "inlet=plane:0,0,-16:0,0,1:0.01", "--set", "outlet=plane:0,0,16:0,0,1:0.01"]
+    words = ["convert", vessel / "v.vtu", vessel / "w.vtu", *ends, "--set", "side=boundary-inlet-outlet", "--force"]
+    assert exit_code(*words) == 0
+    loaded = tetopt.load_mesh(vessel / "w.vtu")
+    length = 2.0 * HALF_LENGTH
+    assert area(loaded, "inlet") == pytest.approx(np.pi * RADII[1] ** 2, rel=0.02)
+    assert area(loaded, "side") == pytest.approx(2.0 * np.pi * RADII[1] * length, rel=0.02)
+    interface = area(loaded, "interface_wall_blood")
+    assert interface == pytest.approx(2.0 * np.pi * RADII[0] * length, rel=0.02)
+    sides = ["--set", "lumen=inner:boundary-inlet-outlet", "--set", "outside=outer:boundary-inlet-outlet"]
+    kept = ["convert", vessel / "v.vtu", vessel / "k.vtu", *ends, *sides, "--keep-labels", "wall", "--force"]
+    assert exit_code(*kept) == 0
+    wall = tetopt.load_mesh(vessel / "k.vtu")
+    assert set(np.unique(wall.cell_data["label"])) == {WALL}
+    assert area(wall, "lumen") == pytest.approx(interface, rel=1e-12)
+    assert area(wall, "interface_wall_blood") == pytest.approx(interface, rel=1e-12)
+    assert area(wall, "outside") == pytest.approx(area(loaded, "side"), rel=1e-12)
+    assert inward(wall, "lumen", np.zeros(3)) == 1.0
+    assert inward(wall, "outside", np.zeros(3)) == 0.0
+    assert area(wall, "inlet") == pytest.approx(np.pi * (RADII[1] ** 2 - RADII[0] ** 2), rel=0.03)
+
+
+def test_an_interface_is_seen_from_either_side(vessel):
+    words = ["convert", vessel / "v.vtu", vessel / "s.vtu", "--set", "from_blood=interface_blood_wall", "--force"]
+    assert exit_code(*words) == 0
+    loaded = tetopt.load_mesh(vessel / "s.vtu")
+    label = loaded.cell_data["label"]
+    assert set(label[loaded.sets.facets["interface_wall_blood"][:, 0]]) == {WALL}
+    assert set(label[loaded.sets.facets["from_blood"][:, 0]]) == {BLOOD}
+    assert area(loaded, "from_blood") == area(loaded, "interface_wall_blood")
+
+
+def test_what_is_left_out_is_gone_with_its_nodes(vessel):
+    """Of either order, fields stay with their cells and nodes; a set on both sides keeps the part that is left."""
+    loaded = tetopt.load_mesh(vessel / "v.vtu")
+    mesh = loaded.mesh
+    for order in (1, 2):
+        nodes = mesh.points if order == 1 else quadratic(mesh.points, mesh.cells)[0]
+        model = tetopt.build_model(mesh, order=order)._replace(point_data={"place": nodes}, cell_data=loaded.cell_data)
+        path = vessel / f"o{order}.vtu"
+        tetopt.save_model(path, model)
+        out = vessel / f"p{order}.vtu"
+        assert exit_code("convert", path, out, "--drop-labels", BLOOD, "--force") == 0
+        part = tetopt.load_mesh(out)
+        np.testing.assert_array_equal(part.point_data["place"], of_order(part.mesh.points, part.mesh.cells, order)[0])
+        is_kept = loaded.cell_data["label"] != BLOOD
+        np.testing.assert_array_equal(part.cell_data["mean"], loaded.cell_data["mean"][is_kept])
+        assert len(np.unique(part.mesh.cells)) == len(part.mesh.points)
+        np.testing.assert_allclose(part.mesh.cell_volumes, mesh.cell_volumes[is_kept], rtol=1e-12)
+
+
+def test_only_the_labels_that_stay_are_meshed(vessel):
+    loaded, numbers = tetopt.load_mesh(vessel / "v.vtu"), numbers_in(vessel / "v.json")
+    assert set(np.unique(loaded.cell_data["label"])) == {WALL, BLOOD}
+    assert numbers["inputs"]["kept_labels"] == [WALL, BLOOD]
+    volume = np.pi * RADII[1] ** 2 * 2.0 * HALF_LENGTH
+    assert loaded.mesh.cell_volumes.sum() == pytest.approx(volume, rel=0.02)
+    words = ["mesh", vessel / "l.nii.gz", "-o", vessel / "b.vtu", "--labels", vessel / "l.nii.gz", "--nodes", "300"]
+    names = ["--label-names", vessel / "names.csv", "--iterations", "2"]
+    assert exit_code(*words, *names, "--keep-labels", "blood", "--force") in (0, 1)
+    blood = tetopt.load_mesh(vessel / "b.vtu")
+    assert set(np.unique(blood.cell_data["label"])) == {BLOOD}
+    assert blood.label_table.names[BLOOD] == "blood"
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "match"),
+    [
+        ("mesh", ["--keep-labels", "2", "--drop-labels", "1"], "give only one of them"),
+        ("mesh", ["--keep-labels", "7"], 'there is no label "7"; there are 0, 1, 2'),
+        ("mesh", ["--drop-labels", "0,1,2"], "no label would be left"),
+        ("convert", ["--keep-labels", "liver"], "no label has this name"),
+        ("convert", ["--set", "side=boundary-inlett"], 'no set of facets begins "inlett"'),
+        ("convert", ["--set", "cavity=inner:boundary"], "inner boundary has no facet"),
+        ("convert", ["--set", "none=boundary-boundary"], "the difference boundary-boundary has no facet"),
+    ],
+)
+def test_other_labels_and_sets_are_rejected(vessel, capfd, command, options, match):
+    capfd.readouterr()
+    words = [vessel / "l.nii.gz", "--labels", vessel / "l.nii.gz", "-o"] if command == "mesh" else [vessel / "v.vtu"]
+    assert_refused(capfd, [command, *words, vessel / "no.vtu", *options], match)
+    assert not (vessel / "no.vtu").exists()
+
+
+@pytest.fixture(scope="module")
+def cup(tmp_path_factory):
+    """A left ventricle: half an ellipsoid of blood in muscle, open at the top face of the box."""
+    folder = tmp_path_factory.mktemp("cup")
+    x, y, z = np.indices((40, 40, 30)) - np.array([19.5, 19.5, 29.5]).reshape(3, 1, 1, 1)
+    blood, muscle = ((x / a) ** 2 + (y / a) ** 2 + (z / c) ** 2 <= 1.0 for a, c in ((11.0, 20.0), (17.0, 26.0)))
+    labels = np.where(blood, BLOOD, np.where(muscle, WALL, 0))
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels, np.eye(4)))
+    tetopt.save_image(folder / "m.nii.gz", tetopt.Image(1.0 * (labels == WALL), np.eye(4)))
+    return folder
+
+
+def half_spheroid(a, c):
+    """Area of half a prolate spheroid without its base."""
+    e = np.sqrt(1.0 - (a / c) ** 2)
+    return np.pi * a**2 * (1.0 + c / (a * e) * np.arcsin(e))
+
+
+def test_endocardium_and_epicardium_with_blood_and_without(cup):
+    """Meshed without blood, or with a label of blood that is dropped afterwards: the same areas, those of spheroids."""
+    sides = ["--set", "endo=inner:boundary-superior", "--set", "epi=outer:boundary-superior", "--nodes", "2500"]
+    words = ["mesh", cup / "l.nii.gz", "--force", "-o"]
+    assert exit_code(*words, cup / "a.vtu", "--mask", cup / "m.nii.gz", *sides) in (0, 1)
+    assert exit_code(*words, cup / "b.vtu", "--labels", cup / "l.nii.gz", "--drop-labels", "0", *sides[4:]) in (0, 1)
+    assert exit_code("convert", cup / "b.vtu", cup / "c.vtu", "--drop-labels", BLOOD, *sides[:4], "--force") == 0
+    alone, dropped = tetopt.load_mesh(cup / "a.vtu"), tetopt.load_mesh(cup / "c.vtu")
+    for name, (a, c) in {"endo": (11.0, 20.5), "epi": (17.0, 26.5)}.items():
+        assert area(alone, name) == pytest.approx(area(dropped, name), rel=0.03)
+        assert area(alone, name) == pytest.approx(half_spheroid(a, c), rel=0.05)
+    assert area(dropped, "endo") == pytest.approx(area(dropped, f"interface_{WALL}_{BLOOD}"), rel=1e-12)
+    rows = np.concatenate([dropped.sets.facets[name] for name in ("endo", "epi", "superior")])
+    assert sorted(map(tuple, rows.tolist())) == sorted(map(tuple, boundary_rows(dropped.mesh).tolist()))

@@ -1,0 +1,133 @@
+"""A field of a mesh's file, or an image moved by it, on the voxels of an image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.contents.labels import is_label_map
+from tetopt.energy.sampling import overlap_of
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
+from tetopt.job.convert import with_results
+from tetopt.job.events import note, progress
+from tetopt.job.inputs import read_companion, read_mesh, warn_of_other_image
+from tetopt.job.options import VoxelOptions
+from tetopt.model.fields import half_turned_fields
+from tetopt.model.file import MeshFile
+from tetopt.model.on_image import At, field_on_image, warped_image
+from tetopt.report.summary import versions
+
+
+def is_image_name(path: Path) -> bool:
+    """Return whether a file of this name is an image rather than a mesh."""
+    return path.name.lower().endswith(OUTPUT_SUFFIXES)
+
+
+def write_on_image(
+    mesh: Path, output: Path, options: VoxelOptions, *, like: Path | None = None, results: Path | None = None,
+    space: str = "ras", is_registered: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image moved by it.
+
+    Parameters
+    ----------
+    mesh : Path
+    output : Path
+        NIfTI.
+    options : VoxelOptions
+    like : Path, optional
+        The image whose voxels get the field, unless `options` name one.
+    results : Path, optional
+        CalculiX's results for this mesh, which have the field.
+    space : {"ras", "lps"}
+        Axes of vectors and tensors in the file.
+    is_registered : bool
+        Accept the voxels of another image than the mesh's.
+
+    Returns
+    -------
+    dict
+        Numbers of the file: field, image, voxels inside, least and greatest value.
+
+    Raises
+    ------
+    InputError
+        No field or image is named; files cannot be read, or do not belong together; no voxel lies in the mesh, or one
+        lies in several cells.
+    """
+    path = options.like or like or options.warp
+    if path is None:
+        raise InputError(f"{output}: on the voxels of which image? pass `like`")
+    loaded = read_mesh(mesh) if results is None else with_results(read_mesh(mesh), results)
+    name, values, at = _field_of(loaded, mesh, options.field_name)
+    if options.warp is not None and at != "nodes":
+        raise InputError(f"`warp`: expected a displacement of nodes, but {name} is a field of cells")
+    image = read_companion(path)
+    if image.ndim != loaded.mesh.ndim:
+        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
+    warn_of_other_image(loaded, mesh, path, image, is_registered=is_registered)
+    if (overlap := overlap_of(image, loaded.mesh)) is not None:
+        raise InputError(f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again")
+    numbers: dict[str, Any] = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
+    if options.warp is None:
+        turned = half_turned_fields({name: values})[name]
+        has_axes = turned is not values  # of a vector or tensor in RAS+
+        if space == "lps" and values.ndim > 1 and not has_axes:
+            raise InputError(f"`space`: lps turns displacements, strains and stresses; the axes of {name} are unknown")
+        values = turned if space == "lps" else values
+        outside = np.nan if options.outside is None else options.outside
+        on_voxels = field_on_image(loaded.mesh, values, image, at=at)
+        inside = np.isfinite(on_voxels.reshape(*image.shape, -1)[..., 0])
+        _check_any(inside, f"{mesh} and {path}")
+        on_voxels[~inside] = outside
+        save_voxels(output, on_voxels, image)
+        words, space_of = name, space if has_axes else None
+        words += f", {values[0].size} components" if values.ndim > 1 else ""
+        words += "" if space_of is None else f" ({space.upper()}+)"
+    else:
+        outside = 0.0 if options.outside is None else options.outside
+        other, words, space_of = read_companion(options.warp), f"{options.warp} moved by {name}", None
+        nothing = Image(np.ones_like(other.data), other.affine)
+        inside = warped_image(loaded.mesh, values, nothing, image).data > 0.0
+        is_map = is_label_map(other)
+        moved = warped_image(loaded.mesh, values, other, image, is_nearest=is_map, outside=outside)
+        _check_any(inside, f"{mesh} and {path}")
+        save_image(output, moved)
+        on_voxels = moved.data.astype(np.float64)
+        words += ", nearest voxels, as of labels" if is_map else ", linear between voxels"
+        numbers["warp"] = options.warp.name
+    least, most = float(on_voxels[inside].min()), float(on_voxels[inside].max())
+    where = f"on {np.count_nonzero(inside)} of {inside.size} voxels of {path}, {'NaN' if np.isnan(outside) else format(outside, 'g')} elsewhere"
+    progress(f"{output}: {words}; {least:.4g} to {most:.4g} {where}")
+    return numbers | {
+        "like": path.name, "n_voxels": int(np.count_nonzero(inside)), "least": least, "greatest": most,
+        "outside": None if np.isnan(outside) else outside, "space": space_of, "versions": versions(),
+    }  # fmt: skip
+
+
+def _field_of(loaded: MeshFile, mesh: Path, name: str | None) -> tuple[str, NDArray, At]:
+    """Return a field of nodes or cells, and which; raise InputError with the known fields if there is none."""
+    fields: dict[str, tuple[NDArray, At]] = {each: (rows, "cells") for each, rows in loaded.cell_data.items()}
+    fields |= {each: (rows, "nodes") for each, rows in loaded.point_data.items()}
+    if name is None or name not in fields:
+        known = ", ".join(fields) or "none"
+        problem = "which field? pass `field`" if name is None else f'has no field "{name}"'
+        raise InputError(f"{mesh}: {problem}; it has {known}")
+    if name in loaded.cell_data and name in loaded.point_data:
+        note(f'{mesh}: has "{name}" at nodes and in cells; that at nodes is written')
+    values, at = fields[name]
+    if at == "nodes" and loaded.mesh.ndim == 2 and values.shape[1:] == (3,):  # as VTK stores vectors
+        values = values[:, :2]
+    if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+        raise InputError(f"{mesh}: expected finite numbers in {name}")
+    return name, values, at
+
+
+def _check_any(inside: NDArray[np.bool_], what: str) -> None:
+    if not inside.any():
+        raise InputError(f"{what}: no voxel centre is inside the mesh; do both use the same world coordinates?")
