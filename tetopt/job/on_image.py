@@ -102,7 +102,8 @@ def write_on_image(
         words += ", nearest voxels, as of labels" if is_map else ", linear between voxels"
         numbers["warp"] = options.warp.name
     least, most = float(on_voxels[inside].min()), float(on_voxels[inside].max())
-    where = f"on {np.count_nonzero(inside)} of {inside.size} voxels of {path}, {'NaN' if np.isnan(outside) else format(outside, 'g')} elsewhere"
+    rest = "NaN" if np.isnan(outside) else f"{outside:g}"
+    where = f"on {np.count_nonzero(inside)} of {inside.size} voxels of {path}, {rest} elsewhere"
     progress(f"{output}: {words}; {least:.4g} to {most:.4g} {where}")
     return numbers | {
         "like": path.name, "n_voxels": int(np.count_nonzero(inside)), "least": least, "greatest": most,
