@@ -2,8 +2,9 @@
 Write a format of your own
 ==========================
 
-To support another solver, write a function from a model to text and register it with one call. The example is SOFA: a
-scene with the mesh, a modulus per element, supports, forces and springs. Not yet verified in SOFA.
+To support another solver, write a function from a model to text and register it with one call. The examples are
+openCARP: the mesh with a region for each label; and SOFA: a scene with the mesh, a modulus per element, supports, forces
+and springs. Not yet verified in SOFA.
 """
 
 import tempfile
@@ -17,6 +18,39 @@ import tetopt
 from tetopt.model.loads import facet_forces, spring_constants
 
 # %%
+# openCARP reads a mesh from two text files: the nodes, in micrometres, and the cells with a region each, here their
+# label. Each is a format of its own. Not yet verified in openCARP.
+
+
+def pts(model):
+    """The nodes' file."""
+    rows = (" ".join(map(repr, row)) for row in (1000.0 * model.mesh.points).tolist())
+    return "\n".join([str(len(model.mesh.points)), *rows, ""])
+
+
+def elem(model):
+    """The tetrahedra's file."""
+    rows = np.column_stack([model.mesh.cells, model.cell_data["label"]]).tolist()
+    return "\n".join([str(len(rows)), *(f"Tt {' '.join(map(str, row))}" for row in rows), ""])
+
+
+tetopt.register_format(".pts", pts, "openCARP nodes")
+tetopt.register_format(".elem", elem, "openCARP cells")
+phantom = tetopt.load_phantom("sphere")
+image, labels = phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4)
+result = tetopt.mesh_image(image, 300, labels=labels, iterations=3)
+with tempfile.TemporaryDirectory() as folder:
+    for suffix in (".pts", ".elem"):
+        tetopt.save_mesh(Path(folder) / f"heart{suffix}", result.mesh, {"label": result.labels})
+    points = np.loadtxt(Path(folder) / "heart.pts", skiprows=1) / 1000.0
+    cells = np.loadtxt(Path(folder) / "heart.elem", skiprows=1, usecols=range(1, 6), dtype=int)
+counts = np.bincount(cells[:, 4])
+extent_mm = np.ptp(points, axis=0).round(1)
+print(f"openCARP: {len(points)} nodes over {extent_mm} mm, {counts.tolist()} cells by region")
+
+# %%
+# SOFA takes a scene of objects.
+#
 # A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads. `repr` writes a number
 # without losing a digit. Each load becomes one SOFA object; anything that a scene cannot represent is rejected.
 
@@ -95,7 +129,6 @@ def sofa(model):
 
 tetopt.register_format(".scn", sofa, "SOFA scene", runs=True)
 
-image = tetopt.load_phantom("sphere").image(voxel_mm=4)
 mesh = tetopt.mesh_image(image, nodes=300, iterations=3).mesh
 loads = ["hold:inferior", "pressure:superior:0.1"]
 model = tetopt.build_model(mesh, image, young="0.5+0.02*h", nu=0.3, loads=loads)
