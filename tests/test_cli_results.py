@@ -166,12 +166,12 @@ def test_a_displacement_goes_onto_the_voxels_of_an_image(folder, order, capsys):
     moved = ["convert", folder / "b.vtu", folder / "w.nii.gz", "--field", "displacement", "--warp", folder / "i.nii.gz"]
     assert exit_code(*moved) == 0
     found = tetopt.load_image(folder / "w.nii.gz")
-    told = " ".join(capsys.readouterr().out.split())
-    assert ("nearest voxels, as of labels" in told) != ("linear between voxels" in told)
-    is_nearest = "nearest voxels" in told
     field = tetopt.load_mesh(folder / "b.vtu").point_data["displacement"]
-    again = tetopt.warped_image(mesh, field, image, is_nearest=is_nearest)
-    np.testing.assert_array_equal(found.data, again.data)
+    again = tetopt.warped_image(mesh, field, image)
+    assert exit_code(*moved, "--nearest", "--force") == 0
+    nearest = tetopt.load_image(folder / "w.nii.gz").data
+    assert set(nearest.ravel()) <= {*image.data.ravel(), 0.0}
+    np.testing.assert_allclose(found.data, again.data, atol=1e-5)
 
 
 def test_an_image_of_a_field_needs_the_field_and_the_voxels(folder, order, capfd):
@@ -184,7 +184,15 @@ def test_an_image_of_a_field_needs_the_field_and_the_voxels(folder, order, capfd
     )
     assert_refused(capfd, [*words, "--field", "heat"], "which image")
     assert_refused(capfd, [*words, *like, "--field", "heat", "--young", "3"], "--young: has no effect")
-    assert_refused(capfd, [*words, "--field", "mean", "--warp", folder / "i.nii.gz"], "displacement of nodes")
+    warp = ["--warp", folder / "i.nii.gz"]
+    assert_refused(
+        capfd, [*words, "--field", "mean", *warp], "displacement of nodes, but mean in .* is a field of cells"
+    )
+    assert_refused(capfd, [*words, "--field", "displacement_step7", *warp, "--outside", "nan"], "--outside: expected a")
+    assert_refused(capfd, [*words, "--field", "displacement_step7", *warp, "--space", "lps"], "--space: has no effect")
+    twice = ["convert", folder / "i.nii.gz", folder / "a.vtu", folder / "u.nii.gz", "--field", "heat"]
+    assert_refused(capfd, [*twice, *like], "give only one image")
+    assert_refused(capfd, [*words, *like, "--field", "heat", "--nearest"], "--nearest: needs --warp")
     assert_refused(capfd, ["convert", folder / "a.vtu", folder / "u.inp", *like], "--like: has no effect")
     far = np.eye(4)
     far[:3, 3] = 1e4

@@ -109,6 +109,50 @@ def test_only_the_labels_that_stay_are_meshed(vessel):
     assert blood.label_table.names[BLOOD] == "blood"
 
 
+def test_loads_and_the_mask_of_what_is_left_out_go(vessel, capsys):
+    """The sets of the same names are others now."""
+    words = [
+        "convert",
+        vessel / "v.vtu",
+        vessel / "l.vtu",
+        "--young",
+        "2",
+        "--nu",
+        "0.3",
+        "--load",
+        "pressure:boundary:1",
+    ]
+    assert exit_code(*words, "--load", "hold:inferior", "--force") == 0
+    capsys.readouterr()
+    assert exit_code("convert", vessel / "l.vtu", vessel / "m.vtu", "--drop-labels", "blood", "--force") == 0
+    assert "left out: pressure:boundary:1" in " ".join(capsys.readouterr().err.split())
+    before, after = tetopt.load_mesh(vessel / "l.vtu"), tetopt.load_mesh(vessel / "m.vtu")
+    assert (before.text("mask") is None, after.text("mask") is None) == (False, True)
+    assert "loads" in before.field_data
+    assert "loads" not in after.field_data
+
+
+def test_separate_bodies_and_a_lumen_alone():
+    """A tube in a tube has two lumens and two outsides; a tunnel's wall is inner with nothing around it."""
+    x, y = np.indices((30, 30, 8))[:2] - 14.5
+    far = np.hypot(x, y)
+    image = tetopt.Image(1.0 * (((far > 4) & (far <= 7)) | ((far > 10) & (far <= 14))), np.eye(4))
+    mesh = tetopt.mesh_image(image, 1500, mask=image, iterations=2).mesh
+    box = tetopt.Box(image.shape, image.affine)
+    sides = ["in=inner:boundary-inferior-superior", "out=outer:mask_surface"]
+    sets = tetopt.build_model(mesh, box=box, sets=sides).sets.facets
+    radius = {name: np.hypot(*(mesh.points[facet_triples(mesh.cells, sets[name])].mean(axis=1)[:, :2] - 14.5).T)
+              for name in ("in", "out")}  # fmt: skip
+    for name, (near, farther) in {"in": (4, 10), "out": (7, 14)}.items():
+        off = np.minimum(np.abs(radius[name] - near), np.abs(radius[name] - farther))
+        assert off.max() < 1.3  # of radii that are 3 apart
+        assert len(np.unique(radius[name] > 8.5)) == 2
+    block = tetopt.Image(1.0 * (far > 5), np.eye(4))
+    tunnel = tetopt.mesh_image(block, 800, mask=block, iterations=2).mesh
+    lumen = tetopt.build_model(tunnel, box=box, sets=["lumen=inner:mask_surface"]).sets.facets
+    np.testing.assert_array_equal(lumen["lumen"], lumen["mask_surface"])
+
+
 @pytest.mark.parametrize(
     ("command", "options", "match"),
     [
@@ -117,6 +161,7 @@ def test_only_the_labels_that_stay_are_meshed(vessel):
         ("mesh", ["--drop-labels", "0,1,2"], "no label would be left"),
         ("convert", ["--keep-labels", "liver"], "no label has this name"),
         ("convert", ["--set", "side=boundary-inlett"], 'no set of facets begins "inlett"'),
+        ("convert", ["--set", "side=outer:"], "expected names of sets"),
         ("convert", ["--set", "cavity=inner:boundary"], "inner boundary has no facet"),
         ("convert", ["--set", "none=boundary-boundary"], "the difference boundary-boundary has no facet"),
     ],

@@ -3,8 +3,8 @@ Write a format of your own
 ==========================
 
 To support another solver, write a function from a model to text and register it with one call. The examples are
-openCARP: the mesh with a region for each label; and SOFA: a scene with the mesh, a modulus per element, supports, forces
-and springs. Not yet verified in SOFA.
+openCARP: the mesh with a region for each label; and SOFA: a scene with the mesh, a modulus per element, supports,
+forces and springs. Not yet verified in SOFA.
 """
 
 import tempfile

@@ -118,6 +118,11 @@ def test_other_rows_and_displacements_are_rejected():
         tetopt.warped_image(mesh, -2.0 * mesh.points, image)
     with pytest.raises(tetopt.InputError, match="3 numbers for each node"):
         tetopt.warped_image(mesh, mesh.points[:, :2], image)
+    far = tetopt.Image(np.zeros((3, 3, 3)), np.diag([1.0, 1.0, 1.0, 1.0]) + 1e4 * np.eye(4, k=3))
+    with pytest.raises(tetopt.InputError, match="image: no voxel of it is inside the mesh"):
+        tetopt.warped_image(mesh, np.zeros_like(mesh.points), far, image)
+    with pytest.raises(tetopt.InputError, match="expected a 3-D image like the mesh, got a 2-D one"):
+        tetopt.warped_image(mesh, np.zeros_like(mesh.points), oblique(2), image)
     # Two triangles and two between them and a third: as many cells as nodes only where a ring closes.
     ring = 2.0 * np.column_stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)])
     cells = [[k, 8 + k, 8 + (k + 1) % 8] for k in range(8)] + [[k, 8 + (k + 1) % 8, (k + 1) % 8] for k in range(8)]

@@ -34,7 +34,7 @@ def convert_command(
     ] = None,
     results_path: Annotated[
         Path | None,
-        Option("JOB.frd", "Add CalculiX's results for this mesh (VTK formats only).", "results"),
+        Option("JOB.frd", "Add CalculiX's results for this mesh (VTK formats and images).", "results"),
     ] = None,
     *,
     part: LabelledPart,

@@ -478,6 +478,10 @@ def _check(
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
             raise InputError(f"{name}: expected the same voxel grid as the first image's; see tetopt.resample_mask")
+    mask = others.get("mask")
+    if mask is not None and not 0.0 <= mask.range[0] <= mask.range[1] <= 1.0:
+        low, high = mask.range
+        raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
     check_weights(len(images), weights, label_weight, smooth_interfaces)
 
 

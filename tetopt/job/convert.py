@@ -82,7 +82,7 @@ def convert_file(
     if image is None and solver.average is not None:
         raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
     if not solver.loads and not is_surface:
-        solver = replace(solver, loads=loads_of(loaded))
+        solver = replace(solver, loads=_loads_of_file(loaded, choice))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
     loaded = _of_labels(loaded, choice)
     about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
@@ -101,6 +101,15 @@ def convert_file(
     files |= {} if results is None else {"results": results.name}
     files |= {name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None}
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
+
+
+def _loads_of_file(loaded: MeshFile, choice: LabelChoice) -> list[str] | None:
+    """Return the loads of a mesh's file; without some of its labels, their sets would be others: warn instead."""
+    loads = loads_of(loaded)
+    if choice == ALL_LABELS or not loads:
+        return loads
+    warning(f"the file's loads were for all labels and are left out: {listed(loads)}; give those of the rest (`load`)")
+    return None
 
 
 def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:

@@ -14,11 +14,11 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
 from tetopt.job.convert import with_results
-from tetopt.job.events import note, progress
-from tetopt.job.inputs import read_companion, read_mesh, warn_of_other_image
+from tetopt.job.events import note, progress, warning
+from tetopt.job.inputs import read_companion, read_mesh
 from tetopt.job.options import VoxelOptions
 from tetopt.model.fields import half_turned_fields
-from tetopt.model.file import MeshFile
+from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
 from tetopt.report.summary import versions
 
@@ -61,24 +61,17 @@ def write_on_image(
         lies in several cells.
     """
     path = options.like or like or options.warp
-    if path is None:
-        raise InputError(f"{output}: on the voxels of which image? pass `like`")
+    _check(output, options, like, space)
+    assert path is not None, "the check requires one"
     loaded = read_mesh(mesh) if results is None else with_results(read_mesh(mesh), results)
-    name, values, at = _field_of(loaded, mesh, options.field_name)
-    if options.warp is not None and at != "nodes":
-        raise InputError(f"`warp`: expected a displacement of nodes, but {name} is a field of cells")
-    image = read_companion(path)
-    if image.ndim != loaded.mesh.ndim:
-        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
-    warn_of_other_image(loaded, mesh, path, image, is_registered=is_registered)
+    name, values, at = _field_of(loaded, mesh, options, space)
+    image = _read(loaded, mesh, path, is_registered)
     if (overlap := overlap_of(image, loaded.mesh)) is not None:
         raise InputError(f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again")
     numbers: dict[str, Any] = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
         turned = half_turned_fields({name: values})[name]
         has_axes = turned is not values  # of a vector or tensor in RAS+
-        if space == "lps" and values.ndim > 1 and not has_axes:
-            raise InputError(f"`space`: lps turns displacements, strains and stresses; the axes of {name} are unknown")
         values = turned if space == "lps" else values
         outside = np.nan if options.outside is None else options.outside
         on_voxels = field_on_image(loaded.mesh, values, image, at=at)
@@ -91,15 +84,20 @@ def write_on_image(
         words += "" if space_of is None else f" ({space.upper()}+)"
     else:
         outside = 0.0 if options.outside is None else options.outside
-        other, words, space_of = read_companion(options.warp), f"{options.warp} moved by {name}", None
+        other, words, space_of = (
+            _read(loaded, mesh, options.warp, is_registered),
+            f"{options.warp} moved by {name}",
+            None,
+        )
+        if not options.nearest and is_label_map(other):
+            warning(f"{options.warp}: seems to be a label image, whose values are interpolated; `nearest` keeps them")
         nothing = Image(np.ones_like(other.data), other.affine)
         inside = warped_image(loaded.mesh, values, nothing, image).data > 0.0
-        is_map = is_label_map(other)
-        moved = warped_image(loaded.mesh, values, other, image, is_nearest=is_map, outside=outside)
+        moved = warped_image(loaded.mesh, values, other, image, is_nearest=options.nearest, outside=outside)
         _check_any(inside, f"{mesh} and {path}")
         save_image(output, moved)
         on_voxels = moved.data.astype(np.float64)
-        words += ", nearest voxels, as of labels" if is_map else ", linear between voxels"
+        words += ", nearest voxels" if options.nearest else ", linear between voxels"
         numbers["warp"] = options.warp.name
     least, most = float(on_voxels[inside].min()), float(on_voxels[inside].max())
     rest = "NaN" if np.isnan(outside) else f"{outside:g}"
@@ -111,8 +109,35 @@ def write_on_image(
     }  # fmt: skip
 
 
-def _field_of(loaded: MeshFile, mesh: Path, name: str | None) -> tuple[str, NDArray, At]:
+def _check(output: Path, options: VoxelOptions, like: Path | None, space: str) -> None:
+    """Raise InputError for options that contradict one another."""
+    if options.like is not None and like is not None:
+        raise InputError(f"`like`: {options.like} and {like}: give only one image whose voxels get the field")
+    if (options.like or like or options.warp) is None:
+        raise InputError(f"{output}: on the voxels of which image? pass `like`")
+    if options.warp is None and options.nearest:
+        raise InputError("`nearest`: needs `warp`")
+    if options.warp is not None and space != "ras":
+        raise InputError("`space`: has no effect on an image that is moved")
+    outside = options.outside
+    if outside is not None and (np.isinf(outside) or (np.isnan(outside) and options.warp is not None)):
+        raise InputError(f"`outside`: expected a finite number, got {outside}")
+
+
+def _read(loaded: MeshFile, mesh: Path, path: Path, is_registered: bool) -> Image:
+    """Read an image in the mesh's world; raise InputError for another dimension or, unless registered, another box."""
+    image = read_companion(path)
+    if image.ndim != loaded.mesh.ndim:
+        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
+    if not is_registered and (words := words_of_other_box(loaded, image)):
+        remedy = "if it is in the same world, pass `registered`"
+        raise InputError(f"{path}: expected the box of {mesh}'s image, {words}; {remedy}")
+    return image
+
+
+def _field_of(loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str) -> tuple[str, NDArray, At]:
     """Return a field of nodes or cells, and which; raise InputError with the known fields if there is none."""
+    name = options.field_name
     fields: dict[str, tuple[NDArray, At]] = {each: (rows, "cells") for each, rows in loaded.cell_data.items()}
     fields |= {each: (rows, "nodes") for each, rows in loaded.point_data.items()}
     if name is None or name not in fields:
@@ -126,6 +151,15 @@ def _field_of(loaded: MeshFile, mesh: Path, name: str | None) -> tuple[str, NDAr
         values = values[:, :2]
     if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
         raise InputError(f"{mesh}: expected finite numbers in {name}")
+    is_unknown = half_turned_fields({name: values})[name] is values and values.ndim > 1
+    if is_unknown and "lps" in (space, loaded.space):
+        what = "its file" if loaded.space == "lps" else "`space`"
+        raise InputError(
+            f"{mesh}: the axes of {name} are unknown, and {what} is lps; rename it displacement if it is one"
+        )
+    if options.warp is not None and (at != "nodes" or values.shape[1:] != (loaded.mesh.ndim,)):
+        kind = f"a field of {at} with {values[0].size} number{'s' * (values[0].size > 1)} each"
+        raise InputError(f"`warp`: expected a displacement of nodes, but {name} in {mesh} is {kind}")
     return name, values, at
 
 

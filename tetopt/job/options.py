@@ -132,8 +132,9 @@ class VoxelOptions:
         float | None, Option("VALUE", "Value of voxels outside the mesh (default NaN; 0 with `warp`).")
     ] = None
     warp: Annotated[
-        Path | None, Option("IMAGE", "Write this image moved by `field`, a displacement; nearest voxels of labels.")
+        Path | None, Option("IMAGE", "Write this image moved by `field`, a displacement, linear between voxels.")
     ] = None
+    nearest: Annotated[bool, Option(None, "With `warp`: take the nearest voxel's value, as for labels.")] = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,6 +78,8 @@ def _around(labels: Image | None, mask: Image, mesh: Mesh) -> tuple[Image | None
     within = [
         np.append(np.flatnonzero(inside.any(axis=rest)), along) for rest, along in zip(others, index.T, strict=True)
     ]
+    if not inside.any():
+        return labels, mask
     start = [max(int(each.min()) - AROUND_VOXELS, 0) for each in within]
     stop = [min(int(each.max()) + AROUND_VOXELS + 2, size) for each, size in zip(within, mask.shape, strict=True)]
     return None if labels is None else labels.box(start, stop), mask.box(start, stop)

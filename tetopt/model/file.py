@@ -340,6 +340,7 @@ def with_labels(loaded: MeshFile, kept: Sequence[int]) -> MeshFile:
         cell_data={name: rows[is_kept] for name, rows in loaded.cell_data.items()},
         point_data={name: rows[nodes] for name, rows in loaded.point_data.items()},
         sets=Sets(facets, {name: rows for name, rows in own.items() if len(rows)}),
+        field_data={name: text for name, text in loaded.field_data.items() if name != MASK_TEXT},  # of all labels
     )
 
 

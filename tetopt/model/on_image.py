@@ -73,6 +73,8 @@ def field_on_image(
     True
     """
     rows = np.asarray(values)
+    if at not in (None, "cells", "nodes"):
+        raise InputError(f'at: expected "cells" or "nodes", got {at!r}')
     if rows.ndim == 0 or rows.dtype.kind not in "biuf":
         raise InputError(f"values: expected an array of numbers, got {rows.dtype} of shape {rows.shape}")
     order = _order_of(mesh, len(rows), at)
@@ -148,8 +150,8 @@ def warped_image(
 ) -> Image:  # fmt: skip
     """Move an image by a displacement of a mesh's nodes.
 
-    Each voxel centre within the deformed mesh gets the image's value at the place that has moved there: linear between
-    voxel centres.
+    Each voxel centre within the deformed mesh gets the image's value at the place that has moved there, if that lies in
+    the image: linear between voxel centres.
 
     Parameters
     ----------
@@ -164,7 +166,7 @@ def warped_image(
     is_nearest : bool
         Take the value of the nearest voxel, as for labels.
     outside : float
-        Value of voxels outside the deformed mesh.
+        Value of other voxels.
 
     Returns
     -------
@@ -184,6 +186,11 @@ def warped_image(
     >>> bool(np.allclose(moved.data[2:], image.data[:-2]))
     True
     """
+    for name, each in (("image", image), ("like", image if like is None else like)):
+        if each.ndim != mesh.ndim:
+            raise InputError(f"{name}: expected a {mesh.ndim}-D image like the mesh, got a {each.ndim}-D one")
+    if not np.isfinite(outside):
+        raise InputError(f"outside: expected a finite number in a moved image, got {outside}")
     u, like, n_nodes = np.asarray(displacement, dtype=np.float64), image if like is None else like, len(mesh.points)
     if u.ndim != 2 or u.shape[1] != mesh.ndim:
         raise InputError(f"displacement: expected {mesh.ndim} numbers for each node, got an array of shape {u.shape}")
@@ -198,6 +205,10 @@ def warped_image(
         raise InputError(f"displacement: in the deformed mesh {overlap}")
     places = field_on_image(moved, before, like, at="nodes").reshape(-1, mesh.ndim)
     inside = np.flatnonzero(np.isfinite(places[:, 0]))
+    at = image.to_index(places[inside])
+    inside = inside[((at >= -0.5) & (at <= np.array(image.shape) - 0.5)).all(axis=1)]
+    if len(inside) == 0:
+        raise InputError("image: no voxel of it is inside the mesh; do both use the same world coordinates?")
     values = np.full(prod(like.shape), outside)
     if is_nearest:
         values[inside] = image.data[tuple(nearest_voxels(image, places[inside]).T)]

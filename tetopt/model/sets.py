@@ -381,7 +381,10 @@ def parse_set(text: str, ndim: int) -> SetRequest:
             f'set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, got "{name}"'
         )
     if is_difference:
-        return SetRequest(name, kind if kind in SIDE_KINDS else "", [], rest if kind in SIDE_KINDS else what)
+        difference = rest if kind in SIDE_KINDS else what
+        if not all(part.strip() for part in difference.split("-")):
+            raise InputError(f'set {name}: expected names of sets, such as boundary-inlet, got "{difference}"')
+        return SetRequest(name, kind if kind in SIDE_KINDS else "", [], difference)
     form, counts = shapes[kind]
     parts = rest.split(":")
     if len(parts) != len(counts):
@@ -434,10 +437,11 @@ def _place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
     for known in sets.facets:
         if known.lower() == name.lower():
             return known, False
-    for known in sets.facets:
-        if known.startswith(INTERFACE_PREFIX) and name.lower() in map(str.lower, _turned_names(known)):
-            return known, True
-    return None
+    interfaces = [each for each in sets.facets if each.startswith(INTERFACE_PREFIX)]
+    turned = [each for each in interfaces if name.lower() in map(str.lower, _turned_names(each))]
+    if len(turned) > 1:
+        raise InputError(f'set: "{name}" may be the other side of {" or ".join(turned)}; rename the labels')
+    return (turned[0], True) if turned else None
 
 
 def _turned_names(name: str) -> list[str]:
@@ -456,31 +460,20 @@ def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> NDA
 def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which facets (K, 2) belong to an inner part: parts are linked by edges (in 2-D by nodes).
 
-    A closed part is inner if it faces a void, as its cells lie around it. An open part, such as the wall of a tube
-    whose ends are other sets, is inner if the box around it lies in that of another part.
+    The facets of an inner part, such as a lumen or a cavity, closed or open, face its own middle.
     """
-    nodes = facet_triples(mesh.cells, rows)
-    n, sides = mesh.ndim, [np.sort(np.delete(nodes, k, axis=1), axis=1) for k in range(mesh.ndim)]
-    _, of_side = np.unique(np.concatenate(sides), axis=0, return_inverse=True)
-    of_side = of_side.reshape(n, -1).T
+    nodes, n = facet_triples(mesh.cells, rows), mesh.ndim
+    sides = [np.sort(np.delete(nodes, k, axis=1), axis=1) for k in range(n)]
+    of_side = np.unique(np.concatenate(sides), axis=0, return_inverse=True)[1].reshape(n, -1).T
     order = np.argsort(of_side.ravel(), kind="stable")
     facet, side = order // n, of_side.ravel()[order]
     is_same = side[1:] == side[:-1]
     n_parts, part = linked(facet[:-1][is_same], facet[1:][is_same], len(rows))
-    is_open = np.zeros(n_parts, dtype=bool)
-    is_open[part[facet[np.bincount(side)[side] == 1]]] = True
-    corners, middle = mesh.points[nodes], mesh.points.mean(axis=0)
-    flux = ((corners.mean(axis=1) - middle) * area_vectors(mesh, rows)).sum(axis=1)
-    inner = np.bincount(part, flux, n_parts) < 0.0
-    low, high = np.full((n_parts, n), np.inf), np.full((n_parts, n), -np.inf)
-    np.minimum.at(low, part, corners.min(axis=1))
-    np.maximum.at(high, part, corners.max(axis=1))
-    within = ON_SIDE_VOXELS * (high - low).max()
-    size = (high - low).prod(axis=1)
-    for k in np.flatnonzero(is_open):
-        holds = (low <= low[k] + within).all(axis=1) & (high >= high[k] - within).all(axis=1)
-        inner[k] = bool((holds & (size > size[k])).any())
-    return inner[part]
+    centres, vectors = mesh.points[nodes].mean(axis=1), area_vectors(mesh, rows)
+    areas = np.linalg.norm(vectors, axis=1)
+    middle = np.stack([np.bincount(part, areas * x, n_parts) / np.bincount(part, areas, n_parts) for x in centres.T], 1)
+    outward = ((centres - middle[part]) * vectors).sum(axis=1)
+    return np.asarray(np.bincount(part, outward, n_parts)[part] < 0.0)
 
 
 def check_free_names(request: SetRequest, sets: Sets) -> None:
