@@ -48,7 +48,9 @@ def test_program(tmp_path, monkeypatch, capsys):
 @pytest.mark.full
 def test_commands(tmp_path, monkeypatch, capsys):
     """The three `tetopt` commands, on a phantom in the place of the T1 and with fewer nodes."""
-    lines = [line for line in README.splitlines() if line.startswith("tetopt ") and "`" not in line]
+    lines = [
+        line for line in README.replace("\\\n", " ").splitlines() if line.startswith("tetopt ") and "`" not in line
+    ]
     commands = [line for line in lines if re.match(r"tetopt (mesh|quality|convert) \S+\.", line)]
     assert len(commands) == 3
     monkeypatch.chdir(tmp_path)

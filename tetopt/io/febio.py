@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_columns, named_materials
+from tetopt.io.tags import named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
 from tetopt.model.loads import Load, count_of_steps, facet_forces, spring_constants
 from tetopt.model.materials import cells_of, density_of
@@ -119,8 +119,6 @@ def _check(model: Model) -> None:
         raise InputError("febio: expected a tetrahedral mesh, got triangles; use .vtu")
     if model.materials is None:
         raise InputError("febio: a part needs a material; give a modulus mapping (`young`)")
-    if taken := {YOUNG_MAP, NU_MAP, DENSITY_MAP, DEAD_FORCES} & model.cell_data.keys():
-        raise InputError(f'febio: the file needs the name "{min(taken)}" for a map; rename the cell data')
     if (count := count_of_steps(model.loads)) > 1:  # each would continue from the previous one
         raise InputError(f"febio: expected one step, got {count}; write a file for each step with only its loads")
 
@@ -193,19 +191,16 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
 
 
 def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
-    """Return element data by part, which FEBio joins by name: `lid` follows the order of the part's cells.
+    """Return moduli by part, which FEBio joins by name: `lid` follows the order of the part's cells.
 
-    A set of all cells would not work: across parts, FEBio uses their order and not that of the set.
+    FEBio reads no other element data, which would be nine tenths of a head's file. A set of all cells would not work:
+    across parts, FEBio uses their order and not that of the set.
     """
-    fields: dict[str, NDArray[np.float64]] = {}
-    for name, values in model.cell_data.items():
-        fields[name] = (values.ravel() if values.size == len(values) else values).astype(np.float64)
-    fields = as_columns(fields)
     assert model.materials is not None
     young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
     stated = {YOUNG_MAP: (parts[0].young, young), NU_MAP: (parts[0].nu, nu)}
     stated[DENSITY_MAP] = parts[0].density, mass_densities(model)
-    fields |= {name: values[of_cell] for name, (word, values) in stated.items() if word == name}
+    fields = {name: values[of_cell] for name, (word, values) in stated.items() if word == name}
     data = [
         f'<ElementData name="{xml_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
