@@ -111,6 +111,8 @@ def errors_on(image, mesh):
 WITH_IMAGE = {
     "E_D": tetopt.E_D,
     "cell_fields": lambda image, mesh: tetopt.cell_fields(mesh, image),
+    "field_on_image": lambda image, mesh: tetopt.field_on_image(mesh, mesh.points, image, at="nodes", outside=0.0),
+    "warped_image": lambda image, mesh: tetopt.warped_image(mesh, 0.0 * mesh.points, image),
     "cell_labels": lambda image, mesh: tetopt.cell_labels(labels_of(image), mesh),
     "cell_moments": tetopt.cell_moments,
     "cell_of_voxel": tetopt.cell_of_voxel,

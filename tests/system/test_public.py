@@ -24,6 +24,8 @@ RIGHT = {
     "resample_labels": {"labels": LABELS, "image": IMAGE},
     "resample_mask": {"mask": LABELS, "image": IMAGE},
     "cell_fields": {"mesh": MESH, "image": IMAGE},
+    "field_on_image": {"mesh": MESH, "values": MESH.points, "image": IMAGE},
+    "warped_image": {"mesh": MESH, "displacement": 0.0 * MESH.points, "image": IMAGE},
     "cell_labels": {"labels": LABELS, "mesh": MESH},
     "cell_moments": {"image": IMAGE, "mesh": MESH},
     "cell_of_voxel": {"image": IMAGE, "mesh": MESH},

@@ -20,6 +20,7 @@ from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, element_facets, elements
+from tetopt.model.sets import area_vectors
 from tetopt.report.tables import new_table, nodes_in_words
 
 MOST_SETS = 20  # printed of facets, of cells, and of materials
@@ -34,11 +35,14 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
         print_line(line)
     if format_of(output).is_surface:
         return
-    table, cells, sets = new_table("set", "facets", "nodes", "cells"), elements(model)[1], model.sets
+    size = "area, mm2" if model.mesh.ndim == 3 else "length, mm"
+    table, cells, sets = new_table("set", "facets", size, "nodes", "cells"), elements(model)[1], model.sets
     for name, rows in list(sets.facets.items())[:MOST_SETS]:
-        table.add_row(escape(name), str(len(rows)), str(len(np.unique(element_facets(cells, rows)))), "")
+        area = np.linalg.norm(area_vectors(model.mesh, rows), axis=1).sum()
+        n_nodes = len(np.unique(element_facets(cells, rows)))
+        table.add_row(escape(name), str(len(rows)), f"{area:.5g}", str(n_nodes), "")
     for name, members in list(sets.cells.items())[:MOST_SETS]:
-        table.add_row(escape(name), "", "", str(len(members)))
+        table.add_row(escape(name), "", "", "", str(len(members)))
     print_table(table)
     if more := len(sets.facets) + len(sets.cells) - table.row_count:
         print_line(f"and {more} more sets")
