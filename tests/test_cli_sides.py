@@ -60,6 +60,10 @@ def test_the_wall_of_a_vessel_without_its_ends(vessel):
     assert set(np.unique(wall.cell_data["label"])) == {WALL}
     assert area(wall, "lumen") == pytest.approx(interface, rel=1e-12)
     assert area(wall, "interface_wall_blood") == pytest.approx(interface, rel=1e-12)
+    assert exit_code("convert", vessel / "v.vtu", vessel / "c.vtu", "--keep-labels", "blood", "--force") == 0
+    core = tetopt.load_mesh(vessel / "c.vtu")  # its side of the interface, too
+    assert area(core, "interface_wall_blood") == pytest.approx(interface, rel=1e-12)
+    assert inward(core, "interface_wall_blood", np.zeros(3)) == 0.0
     assert area(wall, "outside") == pytest.approx(area(loaded, "side"), rel=1e-12)
     assert inward(wall, "lumen", np.zeros(3)) == 1.0
     assert inward(wall, "outside", np.zeros(3)) == 0.0
@@ -107,6 +111,13 @@ def test_only_the_labels_that_stay_are_meshed(vessel):
     blood = tetopt.load_mesh(vessel / "b.vtu")
     assert set(np.unique(blood.cell_data["label"])) == {BLOOD}
     assert blood.label_table.names[BLOOD] == "blood"
+    seg = tetopt.load_image(vessel / "l.nii.gz")
+    half = tetopt.Image(1.0 * (np.indices(seg.shape)[2] < 16), seg.affine)
+    tetopt.save_image(vessel / "half.nii.gz", half)
+    masked = [*words, *names, "--keep-labels", "blood", "--mask", vessel / "half.nii.gz", "--force"]
+    assert exit_code(*masked) in (0, 1)
+    expected = np.pi * RADII[0] ** 2 * HALF_LENGTH
+    assert tetopt.load_mesh(vessel / "b.vtu").mesh.cell_volumes.sum() == pytest.approx(expected, rel=0.03)
 
 
 def test_loads_and_the_mask_of_what_is_left_out_go(vessel, capsys):

@@ -121,6 +121,10 @@ def test_other_rows_and_displacements_are_rejected():
     far = tetopt.Image(np.zeros((3, 3, 3)), np.diag([1.0, 1.0, 1.0, 1.0]) + 1e4 * np.eye(4, k=3))
     with pytest.raises(tetopt.InputError, match="image: no voxel of it is inside the mesh"):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), far, image)
+    part = tetopt.Image(1.0 + image.data[3:], image.affine @ np.array([[1, 0, 0, 3], *np.eye(4)[1:].tolist()]))
+    moved = tetopt.warped_image(mesh, np.zeros_like(mesh.points), part, image, outside=-1.0)
+    assert (moved.data[:2] == -1.0).all()  # not the edge of what there is
+    assert (moved.data[3:] > 0.0).any()
     with pytest.raises(tetopt.InputError, match="expected a 3-D image like the mesh, got a 2-D one"):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), oblique(2), image)
     # Two triangles and two between them and a third: as many cells as nodes only where a ring closes.

@@ -50,7 +50,7 @@ def field_on_image(
 
     Returns
     -------
-    (*shape, ...) float64
+    (s_0, ..., s_{n-1}, ...) float64
         The image's axes, then those of a row. Vectors keep their axes, those of the world.
 
     Raises
