@@ -120,7 +120,7 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     if labels is None:
         raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
     kept = kept_labels(choice.keep_labels, choice.drop_labels, np.unique(labels).tolist(), loaded.label_table.names)
-    part = with_labels(loaded, kept)
+    part = with_labels(loaded, labels, kept)
     left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
     more = f"; their interfaces are sets: {listed(left)}" if left else ""
     note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")

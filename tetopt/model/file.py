@@ -13,7 +13,6 @@ from tetopt.contents.align import SAME_BOX_VOXELS, other_box, resample_mask
 from tetopt.contents.domain import INSIDE_FRACTION, mask_of
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
-from tetopt.geometry.simplex import outward_facet_nodes
 from tetopt.geometry.topology import compact
 from tetopt.image import Image
 from tetopt.interop import notebook
@@ -24,7 +23,17 @@ from tetopt.model.loads import load_words, parse_load
 from tetopt.model.mappings import checked_young
 from tetopt.model.materials import BinningError
 from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
-from tetopt.model.sets import Box, Sets, boundary_rows, label_sets, merged_sets, rows_of, standard_names, standard_sets
+from tetopt.model.sets import (
+    Box,
+    Sets,
+    boundary_rows,
+    facet_triples,
+    label_sets,
+    merged_sets,
+    rows_of,
+    standard_names,
+    standard_sets,
+)
 from tetopt.system.incoming import json_of
 
 MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # cell data in tetopt's files
@@ -301,24 +310,15 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
     return None
 
 
-def with_labels(loaded: MeshFile, kept: Sequence[int]) -> MeshFile:
-    """Return the mesh's file without the cells of other labels.
+def with_labels(loaded: MeshFile, labels: NDArray[np.int64], kept: Sequence[int]) -> MeshFile:
+    """Return the mesh's file without the cells whose `labels` (M,) are not kept.
 
     Each interface of a label that stays with one that goes remains as a set of facets, with its name, as do parts of
     other sets.
-
-    Raises
-    ------
-    InputError
-        The cells have no labels.
     """
-    mesh, n = loaded.mesh, loaded.mesh.ndim
-    labels = labels_of(loaded.cell_data, len(mesh.cells))
-    if labels is None:
-        raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
-    is_kept = np.isin(labels, kept)
-    of_labels, ends = label_sets(mesh, labels, loaded.label_table.names), outward_facet_nodes(n)
-    named = {name for kind in of_labels for name in kind} | standard_names(n)
+    mesh, is_kept = loaded.mesh, np.isin(labels, kept)
+    of_labels = label_sets(mesh, labels, loaded.label_table.names)
+    named = {name for kind in of_labels for name in kind} | standard_names(mesh.ndim)
     facet_sets = {name: rows for name, rows in loaded.sets.facets.items() if name not in named} | of_labels.facets
     used, cells = compact(mesh.cells[is_kept], len(mesh.points))
     now, number = np.cumsum(is_kept) - 1, numbered_edges(mesh.cells)[1]
@@ -328,7 +328,7 @@ def with_labels(loaded: MeshFile, kept: Sequence[int]) -> MeshFile:
     outer = {tuple(row) for row in boundary_rows(part).tolist()}
     for name, rows in facet_sets.items():
         gone = rows[~is_kept[rows[:, 0]]]
-        turned = rows_of(mesh, mesh.cells[gone[:, :1], ends[gone[:, 1]]][:, ::-1])  # as seen from the other cell
+        turned = rows_of(mesh, facet_triples(mesh.cells, gone)[:, ::-1])  # as seen from the other cell
         both = np.concatenate([rows[is_kept[rows[:, 0]]], turned[is_kept[turned[:, 0]]]])
         both = np.unique(np.column_stack([now[both[:, 0]], both[:, 1]]), axis=0)
         if len(both) and (name not in of_labels.facets or tuple(both[0].tolist()) in outer):

@@ -86,15 +86,15 @@ def field_on_image(
     inside = np.flatnonzero(owner >= 0)
     result = np.full((len(owner), rows.shape[1]), outside)
     if order == 0:
-        result[inside] = rows[owner[inside] // n_pieces]
+        result[inside] = rows[owner[inside]]
     else:
-        cells = of_order(mesh.points, mesh.cells, order)[1]
+        nodes, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
 
         def fill(first: int, stop: int) -> None:
             part = inside[first:stop]
             own = owner[part] // n_pieces
             index = np.stack(np.unravel_index(part, image.shape), axis=1)
-            places = _places(mesh, own, image.to_world(index), is_curved)
+            places = _places(mesh, own, image.to_world(index), nodes[cells[own]] if is_curved else None)
             result[part] = np.einsum("ka,kac->kc", shape_values(places, order), rows[cells[own]])
 
         n_numbers = len(inside) * cells.shape[1] * rows.shape[1]
@@ -118,17 +118,17 @@ def _order_of(mesh: Mesh, n_rows: int, at: At | None) -> int:
     return orders[0]
 
 
-def _places(mesh: Mesh, own: NDArray[np.int64], world: NDArray[np.float64], is_curved: bool) -> NDArray[np.float64]:
-    """Barycentric places (K, n+1) of points (K, n), mm, in their cells (K,)."""
+def _places(
+    mesh: Mesh, own: NDArray[np.int64], world: NDArray[np.float64], around: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Barycentric places (K, n+1) of points (K, n), mm, in their cells (K,), with nodes (K, A, n) if curved."""
     corners, n = mesh.cells[own], mesh.ndim
     slopes = volume_gradients(mesh.points, corners) / volumes(mesh.points, corners)[:, None, None]
     places = np.empty((len(own), n + 1))
     places[:, 1:] = np.einsum("kad,kd->ka", slopes[:, 1:], world - mesh.points[corners[:, 0]])
     places[:, 0] = 1.0 - places[:, 1:].sum(axis=1)
-    if not is_curved or len(own) == 0:
+    if around is None or len(own) == 0:
         return places
-    nodes, cells = of_order(mesh.points, mesh.cells, 2, mesh.midpoints)
-    around = nodes[cells[own]]
     edge = np.linalg.norm(around[:, 1] - around[:, 0], axis=1)
     for _ in range(PLACE_STEPS):
         missing = world - np.einsum("ka,kad->kd", shape_values(places, 2), around)
@@ -205,14 +205,14 @@ def warped_image(
         raise InputError(f"displacement: in the deformed mesh {overlap}")
     places = field_on_image(moved, before, like, at="nodes").reshape(-1, mesh.ndim)
     inside = np.flatnonzero(np.isfinite(places[:, 0]))
-    at = image.to_index(places[inside])
-    inside = inside[((at >= -0.5) & (at <= np.array(image.shape) - 0.5)).all(axis=1)]
+    index = image.to_index(places[inside])
+    is_there = ((index >= -0.5) & (index <= np.array(image.shape) - 0.5)).all(axis=1)
+    inside, index = inside[is_there], index[is_there]
     if len(inside) == 0:
         raise InputError("image: no voxel of it is inside the mesh; do both use the same world coordinates?")
     values = np.full(prod(like.shape), outside)
     if is_nearest:
         values[inside] = image.data[tuple(nearest_voxels(image, places[inside]).T)]
     else:
-        index = image.to_index(places[inside]).T
-        values[inside] = scipy.ndimage.map_coordinates(image.data, index, np.float64, order=1, mode="nearest")
+        values[inside] = scipy.ndimage.map_coordinates(image.data, index.T, np.float64, order=1, mode="nearest")
     return Image(values.reshape(like.shape), like.affine)
