@@ -30,6 +30,7 @@ from tetopt.start.label_sizes import parse_label_sizes
 from tetopt.system.files import checked_output, save_json
 
 HEAD_NODES = 130_000
+HEAD_SIZES = "1=0.7t[1:4],2=0.9t[1.5:6],3=1t[1.2:6],4=1.3t[1.5:7],*=1t[2:10]"  # by tissue and thickness
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -151,7 +152,7 @@ def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) 
     """Return `_sized` for the program with one cell size."""
     # CGAL skips label 0, so all labels are raised by one. Padding by a voxel keeps the outer labels whole.
     raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")
-    grid = _written(folder / "labels.raw", raised, labels)
+    grid = written_labels(folder / "labels.raw", raised, labels)
 
     def command(size: float) -> list[str]:
         return [program, str(folder / "labels.raw"), *grid, str(folder / "mesh.bin"), str(size)]
@@ -159,7 +160,7 @@ def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) 
     return _sized(command, 1.8 * (labels.volume / nodes) ** (1 / 3), nodes)
 
 
-def _written(path: Path, padded: NDArray, image: tetopt.Image) -> list[str]:
+def written_labels(path: Path, padded: NDArray, image: tetopt.Image) -> list[str]:
     """Write voxels in the order that CGAL's programs read; return the arguments that describe their grid."""
     padded.transpose(2, 1, 0).tofile(path)
     return [*map(str, padded.shape), *map(str, image.spacing)]
@@ -236,31 +237,40 @@ def head(path: Path, nodes: int, cgal: str | None) -> dict[str, Any]:
     with `nodes`; its sizes are tetopt's target sizes by tissue and thickness, times a factor that gives about the same
     number of nodes.
     """
-    image, words = tetopt.load_image(path), "1=0.7t[1:4],2=0.9t[1.5:6],3=1t[1.2:6],4=1.3t[1.5:7],*=1t[2:10]"
+    image = tetopt.load_image(path)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        out = folder / "out.vtu"
-        command = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(out), "--labels", str(path)]
-        command += ["--background", "0", "--size-min", "1", "--nodes", str(nodes), "--label-size", words]
         # A mesh that violates a requirement (exit code 1) is timed like any other; the row names the requirement.
-        wall, cpu = process_seconds([*command, "--json", str(folder / "run.json"), "--force"], allowed=(0, 1))
+        wall, cpu = process_seconds(head_command(path, folder, nodes), allowed=(0, 1))
         run = json.loads((folder / "run.json").read_text())
-        rows = {"nodes": nodes, "cells": len(tetopt.load_mesh(out).mesh.cells), "wall": wall, "cpu": cpu}
+        rows = {"nodes": nodes, "cells": run["quality"]["n_cells"], "wall": wall, "cpu": cpu}
         rows |= {"peak_gb": run["memory"]["peak_bytes"] / 1e9, "violated": [*run["violated"]], "run": run}
         if cgal is not None:
-            asked = tetopt.Sizes(smallest=1.0, by_label=parse_label_sizes(words))
-            field = tetopt.sizes_by_label(asked, tetopt.content(image, image)).sizes.on_voxels(image)
-            grid = _written(folder / "labels.raw", np.pad(image.data.astype(np.uint8), 1), image)
-
-            def sized(factor: float) -> list[str]:
-                _written(folder / "sizes.raw", np.pad(factor * field, 1, mode="edge").astype(np.float32), image)
-                raw = str(folder / "labels.raw"), str(folder / "sizes.raw")
-                return [cgal, *raw, *grid, str(folder / "mesh.bin"), "1"]
-
-            command, rows["cgal_nodes"] = _sized(sized, 1.0, nodes)
+            command, rows["cgal_nodes"] = sized_head(cgal, image, nodes, folder)
             rows["cgal"] = dict(zip(("wall", "cpu"), process_seconds(command), strict=True))
             rows["over_cgal"] = {clock: rows[clock] / rows["cgal"][clock] for clock in ("wall", "cpu")}
     return rows
+
+
+def head_command(path: Path, folder: Path, nodes: int) -> list[str]:
+    """Return the command for a head's mesh out.vtu and its run.json, by tissue and thickness."""
+    command = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(folder / "out.vtu"), "--labels", str(path)]
+    command += ["--background", "0", "--size-min", "1", "--nodes", str(nodes), "--label-size", HEAD_SIZES]
+    return [*command, "--json", str(folder / "run.json"), "--force"]
+
+
+def sized_head(cgal: str, image: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
+    """Return `_sized` for the program with a head's target sizes, which it scales."""
+    asked = tetopt.Sizes(smallest=1.0, by_label=parse_label_sizes(HEAD_SIZES))
+    field = tetopt.sizes_by_label(asked, tetopt.content(image, image)).sizes.on_voxels(image)
+    grid = written_labels(folder / "labels.raw", np.pad(image.data.astype(np.uint8), 1), image)
+
+    def sized(factor: float) -> list[str]:
+        written_labels(folder / "sizes.raw", np.pad(factor * field, 1, mode="edge").astype(np.float32), image)
+        raw = str(folder / "labels.raw"), str(folder / "sizes.raw")
+        return [cgal, *raw, *grid, str(folder / "mesh.bin"), "1"]
+
+    return _sized(sized, 1.0, nodes)
 
 
 def _tissues(path: Path) -> tetopt.Image:

@@ -152,6 +152,35 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
         assert (tmp_path / f"a.{name}").stat().st_size == (tmp_path / f"quadratic.{name}").stat().st_size
 
 
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".msh2"])
+def test_a_mesh_in_metres_is_read_in_millimetres(folder, tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    assert exit_code("convert", folder / "a.vtu", path, "--units", "Pa") == 0
+    metres = meshio.gmsh.read(path) if suffix == ".msh2" else meshio.read(path)
+    back, first = tetopt.load_mesh(path), tetopt.load_mesh(folder / "a.vtu")
+    np.testing.assert_allclose(metres.points, first.mesh.points / 1000.0, rtol=1e-14, atol=1e-17)
+    np.testing.assert_allclose(back.mesh.points, first.mesh.points, rtol=1e-14, atol=1e-14)
+    if "volume" in back.cell_data:
+        np.testing.assert_allclose(back.cell_data["volume"], first.cell_data["volume"], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "kept"),
+    [
+        ("a.msh", [], ["label"]),
+        ("a.msh", ["--fields", "mean"], ["label", "mean"]),
+        ("a.vtu", ["--fields", "none"], ["label"]),
+        ("a.msh", ["--fields", "all"], None),
+        ("a.vtu", [], None),
+    ],
+)
+def test_fields_of_cells_are_written_as_asked(folder, tmp_path, name, options, kept, capsys):
+    assert exit_code("convert", folder / "a.vtu", tmp_path / name, *options) == 0
+    said, every = capsys.readouterr().err, tetopt.load_mesh(folder / "a.vtu").cell_data
+    assert sorted(tetopt.load_mesh(tmp_path / name).cell_data) == sorted(every if kept is None else kept)
+    assert ("8 fields of cells are not written" in said) == (name == "a.msh" and not options)
+
+
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     options = ["--young", MAPPING, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
     options += ["--json", tmp_path / "b.json"]
@@ -453,8 +482,15 @@ def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, t
     assert {path.name for path in tmp_path.iterdir()} == {"a.inp", "b.inp"}
 
 
-def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path):
-    """Through MPa and LPS and back, into the same CalculiX file as from the first one."""
+@pytest.mark.parametrize(
+    ("units", "in_units"),
+    [
+        ("MPa", ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"]),
+        ("Pa", ["spring:left:500000.0", "1/pressure:inferior:250.0", "1/gravity:0.0,-0.008,-9.81"]),
+    ],
+)
+def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path, units, in_units):
+    """Through other units and LPS and back, into the same CalculiX file as from the first one."""
     words = [
         *("hold:superior", "spring:left:0.5", "1/pressure:inferior:0.25", "1/gravity:0,8,-9810"),
         *("2/traction:inferior:0.5,-2,0.125", "2/move:inferior:free,1,free"),
@@ -463,9 +499,13 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path):
     mapping = ["--young", MAPPING, "--density", "1000 + h", "--average", "nodes", "--image", folder / "a.nii.gz"]
     first, second = tmp_path / "a.vtu", tmp_path / "b.vtu"
     assert exit_code("convert", folder / "a.vtu", first, *mapping, *loads) == 0
-    assert exit_code("convert", first, second, "--units", "MPa", "--space", "lps") == 0
+    assert exit_code("convert", first, second, "--units", units, "--space", "lps") == 0
     texts = [json.loads(tetopt.load_mesh(path).text("loads")) for path in (first, second)]
-    assert texts[1][1:4] == ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"]
+    assert texts[1][1:4] == in_units
+    size = 1e-3 if units == "Pa" else 1.0
+    np.testing.assert_allclose(
+        pyvista.read(second).points * [-1, -1, 1], pyvista.read(first).points * size, rtol=1e-14, atol=1e-300
+    )
     assert exit_code("convert", second, tmp_path / "c.vtu") == 0
     again, before = tetopt.load_mesh(tmp_path / "c.vtu"), tetopt.load_mesh(first)
     np.testing.assert_allclose(again.point_data["young_nodes"], before.point_data["young_nodes"], rtol=1e-14)
@@ -551,7 +591,9 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--average", "mean"], "--average: needs --young"),
         ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
-        ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),
+        ("a.inp", ["--fields", "mean"], "--fields: expected none, mean, all and a file .vtu, .vtk, .xdmf, .msh"),
+        ("a.vtu", ["--fields", "some"], "--fields: expected none, mean, all"),
+        ("a.inp", ["--units", "psi"], "--units: expected kPa or MPa or Pa, got psi"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
         ("a.stl", ["--order", "2"], "--order 2 is for .vtu, .vtk, "),

@@ -164,9 +164,65 @@ def test_separate_bodies_and_a_lumen_alone():
     np.testing.assert_array_equal(lumen["lumen"], lumen["mask_surface"])
 
 
+@pytest.fixture(scope="module")
+def skull(tmp_path_factory):
+    """A ball of bone with two rooms of air, and a canal from the outside into a third."""
+    folder = tmp_path_factory.mktemp("skull")
+    index = np.indices((30, 30, 30))
+    far = [np.linalg.norm(index - np.reshape(middle, (3, 1, 1, 1)), axis=0) for middle in
+           ((15, 15, 15), (10, 15, 15), (20, 15, 15), (15, 15, 22))]  # fmt: skip
+    canal = (np.hypot(index[0] - 15, index[1] - 15) < 2) & (index[2] > 22)
+    labels = np.where((far[1] < 4) | (far[2] < 3) | (far[3] < 3) | canal, 0, np.where(far[0] < 13, BLOOD, 0))
+    labels[1, 1, 1] = WALL
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels.astype(np.uint8), np.diag([1.0, 1.0, 2.0, 1.0])))
+    (folder / "names.csv").write_text("label,name\n1,speck\n2,bone\n", encoding="utf-8")
+    return folder, labels, [int((far[k] < radius).sum()) for k, radius in ((1, 4), (2, 3))]
+
+
+@pytest.mark.parametrize(("word", "label"), [("bone", BLOOD), ("300", 300)])
+def test_enclosed_air_gets_a_label(skull, capsys, word, label):
+    """Told by volume; an open cavity stays, and a number beyond those of the file's type is one, too."""
+    folder, labels, sizes = skull
+    words = ["mesh", folder / "l.nii.gz", "--labels", folder / "l.nii.gz", "--label-names", folder / "names.csv"]
+    words += ["--nodes", "1200", "--iterations", "2", "--background", "0", "-o", folder / f"{word}.vtu", "--force"]
+    assert exit_code(*words, "--fill-holes", word) in (0, 1)
+    told = f"2 holes of {2 * sum(sizes)} mm3, the largest {2 * sizes[0]}"
+    assert told in " ".join(capsys.readouterr().err.split())
+    loaded = tetopt.load_mesh(folder / f"{word}.vtu")
+    of_cell, volume = loaded.cell_data["label"], loaded.mesh.cell_volumes
+    assert set(np.unique(of_cell)) - {0} == {WALL, BLOOD, label} - ({WALL} - set(np.unique(of_cell)))
+    if label == 300:
+        assert volume[of_cell == 300].sum() == pytest.approx(2 * sum(sizes), rel=0.1)
+    bone = 2 * ((labels == BLOOD).sum() + (sum(sizes) if label == BLOOD else 0))
+    assert volume[of_cell == BLOOD].sum() == pytest.approx(bone, rel=0.02)
+    check = ["quality", folder / f"{word}.vtu", "--image", folder / "l.nii.gz", "--labels", folder / "l.nii.gz"]
+    assert exit_code(*check, "--json", folder / "q.json", "--force") in (0, 1)
+    rows = {row["label"]: row for row in numbers_in(folder / "q.json")["labels"]}
+    assert rows[BLOOD]["dice"] > 0.97  # against the filled labels
+
+
+def test_no_hole_is_told(vessel, capsys):
+    words = ["mesh", vessel / "l.nii.gz", "--labels", vessel / "l.nii.gz", "-o", vessel / "h.vtu", "--iterations", "0"]
+    assert exit_code(*words, "--nodes", "300", "--fill-holes", "2", "--force") in (0, 1)
+    assert "no voxel of label 0 is enclosed" in " ".join(capsys.readouterr().err.split())
+
+
+def test_labels_left_out_are_not_measured_as_lost(vessel):
+    """Neither of a mesh built without them, nor after `convert`."""
+    assert exit_code("convert", vessel / "v.vtu", vessel / "k.vtu", "--keep-labels", "blood", "--force") == 0
+    labels = ["--image", vessel / "l.nii.gz", "--labels", vessel / "l.nii.gz", "--json", vessel / "q.json", "--force"]
+    for name, kept in (("v.vtu", {WALL, BLOOD}), ("k.vtu", {BLOOD})):
+        assert exit_code("quality", vessel / name, *labels) in (0, 1)
+        numbers = numbers_in(vessel / "q.json")
+        assert {row["label"] for row in numbers["labels"]} - {0} == kept
+        assert all(row["dice"] > 0.9 for row in numbers["labels"] if row["label"])
+
+
 @pytest.mark.parametrize(
     ("command", "options", "match"),
     [
+        ("mesh", ["--fill-holes", "0"], 'expected one label from 1 to 2147483647, got "0"'),
+        ("mesh", ["--fill-holes", "liver"], "labels have no names"),
         ("mesh", ["--keep-labels", "2", "--drop-labels", "1"], "give only one of them"),
         ("mesh", ["--keep-labels", "7"], 'there is no label "7"; there are 0, 1, 2'),
         ("mesh", ["--drop-labels", "0,1,2"], "no label would be left"),

@@ -219,11 +219,11 @@ def test_units_are_consistent_with_mm():
 
 
 def test_weight_is_in_the_unit_of_forces():
-    """mN or N, of a density in kg/m3."""
+    """mN or N, of a density in kg/m3; in m, too."""
     model = loaded_model(["hold:superior", "gravity:0,0,-9810"])
     of_cell = model.materials.density[model.materials.of_cell]
     weight = 9810.0 * 1e-9 * float((of_cell * volumes(model.mesh.points, model.mesh.cells)).sum())
-    for units, factor in (("kPa", 1.0), ("MPa", 1e-3)):
+    for units, factor in (("kPa", 1.0), ("MPa", 1e-3), ("Pa", 1e-3)):
         data = ET.fromstring(febio(in_units(model, units))).find("MeshData/NodeData")
         assert sum(numbers(node)[2] for node in data) == pytest.approx(-factor * weight, rel=1e-9)
 

@@ -95,7 +95,7 @@ def test_what_the_head_does_not_say_is_assumed(tmp_path):
     """Stresses in kPa; the axes are those that fit."""
     (tmp_path / "a.frd").write_text(re.sub("1Utetopt; [^\n]*", "1Utest", path_of(2).read_text()))
     results, known = (read_frd(path, solved_model(2).mesh) for path in (tmp_path / "a.frd", path_of(2)))
-    assert results.notes == ("a.frd does not state its units: assuming kPa for stresses",)
+    assert results.notes == ("a.frd does not state its units: assuming mm and kPa",)
     np.testing.assert_array_equal(results.point_data["displacement"], known.point_data["displacement"])
     np.testing.assert_allclose(1e3 * results.point_data["stress_nodes"], known.point_data["stress_nodes"], rtol=1e-12)
 

@@ -116,7 +116,7 @@ def test_the_header_says_ras_where_slicer_looks(tmp_path):
     said = "solid.nii mean below 43, Sch?del " + "x" * 90
     assert stl.GetHeader() == f"tetopt SPACE=RAS mm {said}"[:80]
     comments = ply.GetComments()
-    assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == ["SPACE=RAS", f"tetopt; mm; {said}"]
+    assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == ["SPACE=RAS", f"tetopt; mm {said}"]
 
 
 @pytest.mark.parametrize("space", ["ras", "lps"])
@@ -132,7 +132,7 @@ def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
         np.testing.assert_array_equal(back.regular_faces, surface.triangles)
         for name, values in labels.items():
             np.testing.assert_array_equal(back.cell_data[name], values)
-    assert (tmp_path / "a.vtk").read_bytes().splitlines()[1].startswith(f"tetopt, mm, SPACE={space.upper()} ".encode())
+    assert (tmp_path / "a.vtk").read_bytes().splitlines()[1].startswith(f"tetopt, SPACE={space.upper()} mm ".encode())
     assert list(pyvista.read(tmp_path / "a.vtp").field_data["SPACE"]) == [space.upper()]
 
 

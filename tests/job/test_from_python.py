@@ -119,3 +119,22 @@ def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
         np.testing.assert_array_equal(result.labels, written.cell_data["label"])
         with pytest.raises(InputError, match=r"give labels and mask to tetopt\.content"):
             tetopt.mesh_image(tetopt.content(image, labels), labels=labels)
+
+
+def test_a_result_comes_with_its_mask_and_labels(place):
+    """To the model that its content and labels give; of a plain image, with curved cells of order 2."""
+    phantom = tetopt.load_phantom("sphere")
+    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
+    mask = tetopt.Image(1.0 * (np.indices(image.shape)[0] < 8), image.affine)
+    result = tetopt.mesh_image(image, 200, labels=labels, mask=mask, iterations=2, order=2)
+    content = tetopt.content(image, labels, mask)
+    data = tetopt.cell_fields(result.mesh, content) | {"label": result.labels}
+    model = tetopt.build_model(result, young="1 + h", bins=4)
+    other = tetopt.build_model(result.mesh, content, young="1 + h", bins=4, cell_data=data, order=2)
+    assert model.order == 2
+    for name in ("a.vtu", "b.vtu"):
+        tetopt.save_model(place / name, model if name == "a.vtu" else other)
+    assert (place / "a.vtu").read_bytes() == (place / "b.vtu").read_bytes()
+    assert not np.array_equal(model.cell_data["mean"], tetopt.cell_fields(result.mesh, image)["mean"])
+    with pytest.raises(InputError, match="a result of `mesh_image` without an image"):
+        tetopt.build_model(result, image)

@@ -28,8 +28,8 @@ VALUES = {
     "retessellate": "never", "threads": 1, "max_seconds": 5.0, "max_gb": 3.0, "young": "0.5 + 0.01*h", "nu": "0.3",
     "density": "1000", "average": "hill", "bins": "5:log", "sets": ["A=below:1", "B=below:2"], "written_sets": "all",
     "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
-    "space": "lps", "keep_components": True, "free_volumes": True,
-    "keep_labels": "2,liver", "drop_labels": "0", "cells_across": 1.5, "label_size": "1=2",
+    "space": "lps", "fields": "mean", "keep_components": True, "free_volumes": True,
+    "keep_labels": "2,liver", "fill_holes": "3", "drop_labels": "0", "cells_across": 1.5, "label_size": "1=2",
     "merge": "white=2,41; rest=*",
     "tissues": Path("/c1.nii,/c2.nii"), "mask_label": "5,liver", "spacing_mm": "0.5",
 }  # fmt: skip

@@ -113,7 +113,7 @@ def test_components_and_steps_keep_displacements_apart():
         (["compress:5"], "expected compress:P%"),
         (["compress:51%"], "expected compress:P%"),
         (["hold:nowhere"], 'no set of facets "nowhere"; known sets are boundary, left'),
-        (["hold:Left"], "did you mean left"),
+        (["hold:lft"], "did you mean left"),
         (["hold:dark"], '"dark" is a set of cells; give a set of facets, such as boundary'),
         (["hold:left", "move:right:1,2"], "3 finite numbers in mm or free"),
         (["hold:left", "move:right:1,2,inf"], "3 finite numbers"),

@@ -8,7 +8,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
 from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
-from tetopt.model.model import described, in_space, in_units
+from tetopt.model.model import described, in_space, in_units, mass_densities
 from tetopt.model.sets import facet_triples
 
 # Units and space
@@ -38,8 +38,40 @@ def test_units():
     assert described(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
     assert described(other)[2] == "units: mm, MPa, N, mJ, t, s"
     np.testing.assert_allclose(in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15)
-    with pytest.raises(InputError, match="expected kPa or MPa"):
-        in_units(model, "Pa")
+    with pytest.raises(InputError, match="expected kPa or MPa or Pa, got psi"):
+        in_units(model, "psi")
+
+
+def test_with_pascals_lengths_are_in_metres():
+    """Each quantity by the powers of its unit; and back."""
+    kinds = ["hold:inferior", "move:superior:free,0,-2", "pressure:left:3", "spring:right:5", "gravity:0,0,-9810"]
+    model = build_model(sample_model(3).mesh, young=4.0, density=1000.0, loads=kinds)
+    n_cells, n_nodes = len(model.mesh.cells), len(model.mesh.points)
+    model = model._replace(
+        cell_data={
+            "volume": np.full(n_cells, 7.0),
+            "rho": np.full(n_cells, 0.3),
+            "stress_step2": np.full((n_cells, 9), 2.0),
+        },
+        point_data={"displacement": np.full((n_nodes, 3), 5.0)},
+    )
+    other = in_units(model, "Pa")
+    assert described(other)[1:3] == ["coordinates: RAS+, m", "units: m, Pa, N, J, kg, s"]
+    np.testing.assert_allclose(other.mesh.points, model.mesh.points / 1000.0, rtol=1e-15)
+    assert other.materials.young.tolist() == [4000.0]
+    assert mass_densities(other).tolist() == [1000.0]
+    numbers = [load.numbers.tolist() for load in other.loads]
+    expected = [[0.0, 0.0, 0.0], [np.nan, 0.0, -0.002], [3000.0], [5e6], [0.0, 0.0, -9.81]]
+    for found, right in zip(numbers, expected, strict=True):
+        np.testing.assert_allclose(found, right, rtol=1e-15)
+    found = {name: float(values.ravel()[0]) for name, values in (other.cell_data | other.point_data).items()}
+    assert found == pytest.approx(
+        {"volume": 7e-9, "rho": 0.3, "stress_step2": 2000.0, "displacement": 0.005}, rel=1e-15
+    )
+    back = in_units(other, "kPa")
+    np.testing.assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-15)
+    for one, two in zip(back.loads, model.loads, strict=True):
+        np.testing.assert_allclose(one.numbers, two.numbers, rtol=1e-15)
 
 
 def test_the_head_is_of_single_lines():

@@ -150,6 +150,9 @@ def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
     in_mpa = answer(abaqus(in_units(model, "MPa")), tmp_path)
     np.testing.assert_allclose(1e3 * energy(in_mpa), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(in_mpa.u, printed.u, 1e-5)
+    in_metres = answer(abaqus(in_units(model, "Pa")), tmp_path)
+    np.testing.assert_allclose(1e6 * energy(in_metres), energy(printed), rtol=2.0 * PRINTED)  # uJ in a J
+    assert_printed(1e3 * in_metres.u, printed.u, 1e-5)
     turned = answer(abaqus(in_space(model, "lps")), tmp_path)
     np.testing.assert_allclose(energy(turned), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(turned.u * [-1.0, -1.0, 1.0], printed.u, 1e-5)

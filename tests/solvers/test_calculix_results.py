@@ -34,15 +34,16 @@ def test_the_files_that_reading_is_tested_with_are_what_it_writes(order, tmp_pat
         np.testing.assert_allclose(anew.point_data[name], values, rtol=0.0, atol=1e-5 * np.abs(values).max())
 
 
-def test_from_image_to_solver_and_back(tmp_path):
-    """By the commands, in MPa and LPS there: the displacements are those of `tetopt fem`."""
+@pytest.mark.parametrize("units", ["MPa", "Pa"])
+def test_from_image_to_solver_and_back(tmp_path, units):
+    """By the commands, in other units and LPS there: the displacements are those of `tetopt fem`."""
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image(tmp_path / "a.nii.gz", image)
     mapping = ["--young", "0.5 + h/7", "--nu", "0.3"]
     mesh = ["mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", "--spacing", "12", "--iterations", "0"]
     assert exit_code(*mesh) == 0
     inp = ["convert", tmp_path / "a.vtu", tmp_path / "a.inp", "--image", tmp_path / "a.nii.gz", *mapping]
-    assert exit_code(*inp, "--load", "compress:3%", "--units", "MPa", "--space", "lps") == 0
+    assert exit_code(*inp, "--load", "compress:3%", "--units", units, "--space", "lps") == 0
     run(tmp_path, "a")
     assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--results", tmp_path / "a.frd") == 0
     fem = ["fem", tmp_path / "a.nii.gz", tmp_path / "a.vtu", *mapping, "--compress", "3", "-o", tmp_path / "c.vtu"]

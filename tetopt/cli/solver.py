@@ -19,7 +19,7 @@ from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
-from tetopt.model.model import Model, element_facets, elements
+from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements
 from tetopt.model.sets import area_vectors
 from tetopt.report.tables import new_table, nodes_in_words
 
@@ -128,7 +128,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         + ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in ranges)
         + (" mm (RAS)" if model.mesh.ndim == 3 else " mm in its plane")
     )
-    space = f"{solver.space.upper()}+ mm" if model.mesh.ndim == 3 else "mm"
+    length = STRESS_UNITS[solver.units].length
+    space = f"{solver.space.upper()}+ {length}" if model.mesh.ndim == 3 else length
     if form.is_surface:
         yield f"{output}: {form.what}, {space}"
         return

@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import checked_labels, warn_of_absent
+from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, warn_of_absent
 from tetopt.contents.memberships import finer_affine
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError, warn
@@ -338,6 +338,18 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
         f"`background` {limit:g}: {outcome}; choose a level between the background's and the tissue's values (the "
         f"image ranges from {low:g} to {high:g}){instead}"
     )
+
+
+def filled_holes(labels: Image, label: int) -> tuple[Image, NDArray[np.int64]]:
+    """Give a label to the voxels of label 0 that no path through faces of such voxels connects to the box's sides.
+
+    Also return the number of voxels of each hole, the largest first.
+    """
+    empty, sizes = _pieces(labels.data == BACKGROUND_LABEL)
+    sizes[_on_faces(empty)] = 0
+    dtype = np.result_type(labels.data, np.min_scalar_type(label))
+    data = np.where(sizes[empty] > 0, np.array(label, dtype=dtype), labels.data)
+    return Image(data, labels.affine), np.sort(sizes[sizes > 0])[::-1]
 
 
 def background_level(image: Image) -> float:

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt.contents.content import Content
 from tetopt.contents.labels import colours_by_number
 from tetopt.energy.sampling import SamplingGrid
 from tetopt.engine.curving import Curving
@@ -128,6 +129,8 @@ class MeshingResult(NamedTuple):
         For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the smooth level.
     dropped : mapping of int to float
         Volume of the dropped components by label, mm^n; all of label 0 without labels.
+    content : Content, optional
+        What the mesh represents. Only from `mesh_image`.
 
     Examples
     --------
@@ -152,6 +155,7 @@ class MeshingResult(NamedTuple):
     n_dropped: int = 0
     curving: Curving | None = None
     dropped: Mapping[int, float] = MappingProxyType({})
+    content: Content | None = None
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
         """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its labels, if any.

@@ -193,11 +193,12 @@ def mesh_image(
         if isinstance(image, Content):
             raise InputError("mesh_image: give labels and mask to tetopt.content, or an image instead of a content")
         image = make_content(image, labels, mask)
+    image = plain(image)
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind)
     search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
     for attempt in search:
         search.tell(attempt.run())
-    return search.result
+    return search.result._replace(content=image)
 
 
 class Aim(NamedTuple):

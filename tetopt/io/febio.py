@@ -18,7 +18,7 @@ from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is unusable
-STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's names of consistent systems of units
+STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s", "Pa": "SI"}  # FEBio's names of consistent systems of units
 # Names of sets have no spaces, so that these names, and those of parts ("cells of liver"), never clash with them.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
 YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named after their parameters
@@ -254,7 +254,9 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             density = density_of(table)[table.of_cell]
             from tetopt.fem.solution import weight_forces  # imported here, as it loads scipy's solvers
 
-            total += weight_forces(model.mesh, density, load.numbers, model.order) / STRESS_UNITS[model.units].kPa
+            units = STRESS_UNITS[model.units]  # u mm make the numbers those of u^4 mN; a unit of force is u^2 kPa mm2
+            forces = weight_forces(model.mesh, density, load.numbers, model.order)
+            total += forces * (units.mm**2 / units.kPa)
     nodes = np.flatnonzero(total.any(axis=1))
     return nodes, total[nodes]
 

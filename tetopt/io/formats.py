@@ -41,21 +41,25 @@ class Format(NamedTuple):
     is_surface: bool = False  # contains only the boundary
     has_node_moduli: bool = False  # otherwise a modulus that varies within cells is averaged over each
     has_large: bool = False  # whether a step can request large deformation
+    fields: str = "all"  # those of `FIELDS` that commands write by default, "" if the format has no place for them
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
-    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
-    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
-    ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True),
-    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True),
-    ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
-    ".mesh": Format("medit", medit, has_quadratic=True),
-    ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
-    ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
+    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True, fields="none"),
+    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True, fields=""),
+    ".inp": Format(
+        "Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True, fields=""
+    ),
+    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True, fields=""),
+    ".mfem": Format("MFEM mesh", mfem, has_quadratic=True, fields=""),
+    ".mesh": Format("medit", medit, has_quadratic=True, fields=""),
+    ".stl": Format("the boundary as STL", boundary_stl, is_surface=True, fields=""),
+    ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True, fields=""),
 }
+FIELDS = ("none", "mean", "all")  # of cells, besides labels and results
 EXACT_INTEGERS = (".vtu", ".xdmf")  # formats of 64-bit integers; others convert large ones to float64
 MOST_OF_FLOATS = 2**53  # float64 holds all integers up to this one
 # How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
@@ -143,8 +147,8 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         The result of `build_model`.
     space : {"ras", "lps"}
         Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
-    units : {"kPa", "MPa"}
-        Unit of stress in the file; with mm, forces are then in mN or N.
+    units : {"kPa", "MPa", "Pa"}
+        Unit of stress in the file: with mm and mN, mm and N, or m and N.
 
     Raises
     ------

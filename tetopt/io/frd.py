@@ -21,7 +21,7 @@ from tetopt.fem.solution import von_mises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
-from tetopt.model.fields import half_turned_fields, stresses_times
+from tetopt.model.fields import half_turned_fields, scaled_fields
 from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
 from tetopt.system.budget import check_memory, memory_words
 from tetopt.system.extras import install_hint
@@ -137,9 +137,11 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
         )
     head = whole[:HEAD_BYTES].decode("latin-1")
     spaces = re.findall(r"coordinates: (RAS|LPS)\+", head)
+    stated = re.findall(rf"units: m+, ({'|'.join(STRESS_UNITS)}),", head)
+    units = STRESS_UNITS[stated[0] if stated else "kPa"]
+    grid = grid._replace(points=grid.points * units.mm)
     order, space = _checked_mesh(path, mesh, grid, tuple(each.lower() for each in spaces[:1]) or SPACES)
-    units = re.findall(rf"units: mm, ({'|'.join(STRESS_UNITS)}),", head)
-    notes = [] if units else [f"{path.name} does not state its units: assuming kPa for stresses"]
+    notes = [] if stated else [f"{path.name} does not state its units: assuming mm and kPa"]
     point_data: dict[str, NDArray[np.float64]] = {}
     for step, number in sorted(of_steps.items()):
         if stages[number].n_nodes != len(grid.points):
@@ -152,7 +154,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
         point_data |= {f"{name}{suffix}": values for name, values in arrays.items()}
         if stages[number].increment > 1:
             notes.append(f"step {step}: increment {stages[number].increment}, the last in the file")
-    point_data = stresses_times(STRESS_UNITS[units[0] if units else "kPa"].kPa, point_data)
+    point_data = scaled_fields(point_data, units.kPa, units.mm, mesh.ndim)
     return Results(half_turned_fields(point_data) if space == "lps" else point_data, order, tuple(notes))
 
 

@@ -18,10 +18,10 @@ dolfinx keeps one group of each facet, that with the smallest number; the XDMF f
 the mesh that two sets hold from opposite sides is oriented as in the first of them. The nodes of a group are those of
 its elements.
 
-Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data, "young" and "nu" of
-the materials instead of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
-they belong to, because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns
-are vectors, by which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
+Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data, and "young" and
+"nu" of materials that are not groups, instead of cell data of these names. Facets have the values of the cell that they
+belong to, because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns are
+vectors, by which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
 
 More than 1000 materials are only views, not groups; in 2.2 they are rejected.
 
@@ -43,7 +43,6 @@ from tetopt.errors import InputError
 from tetopt.io.tags import (
     Part,
     as_columns,
-    check_apart,
     group_labels,
     group_of_zero,
     numbered_parts,
@@ -91,7 +90,7 @@ def own_comments(lines: list[str]) -> OwnComments | None:
     entities: dict[str, dict[str, list[int]]] = {"cells": {}, "facets": {}}
     zero, labels = None, {}
     for line in lines:
-        if match := re.fullmatch(r"units: mm, (\w+), .*", line):
+        if match := re.fullmatch(r"units: m+, (\w+), .*", line):
             texts["units"] = match[1]
         elif match := re.fullmatch(r"image: (.*), sha256 (\w+)", line):
             texts |= {"image": match[1]} | ({} if match[2] == "unknown" else {"image_sha256": match[2]})
@@ -125,7 +124,7 @@ def gmsh41(model: Model) -> bytes:
     Raises
     ------
     InputError
-        A set has the name of a group of cells or of cell data.
+        A set has the name of a group of cells.
     """
     grouped, comments = model, []
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
@@ -160,7 +159,7 @@ def gmsh41(model: Model) -> bytes:
             f"{sum(counts.values())} {n_elements} 1 {n_elements}\n",
             *(_element_blocks(model, cells, part) for part in parts),
         ),
-        *_views(model, parts),
+        *_views(model._replace(materials=None) if grouped.materials is not None else model, parts),
     )
 
 
@@ -330,12 +329,9 @@ def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
-    """Return all fields of cells, (M,), (M, 3) or (M, 9) float64, by name."""
+    """Return cell data and moduli, (M,), (M, 3) or (M, 9) float64, by name."""
     fields = dict(model.cell_data)
     if model.materials is not None:
         of_cell = model.materials.of_cell
         fields |= {"young": model.materials.young[of_cell], "nu": model.materials.nu[of_cell]}
-    check_apart(list(fields), model.sets.cells)
-    for name, members in model.sets.cells.items():
-        fields[name] = np.isin(np.arange(len(model.mesh.cells)), members)
     return _view_columns(fields)

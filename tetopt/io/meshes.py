@@ -17,7 +17,7 @@ from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in
 from tetopt.mesh import Mesh
-from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
+from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
 from tetopt.model.file import MeshFile, text_in
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
@@ -68,6 +68,9 @@ def load_mesh(path: str | Path) -> MeshFile:
         raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     except InputError as error:
         raise InputError(f"{path}: {plain(str(error))}") from error
+    units = STRESS_UNITS.get(text_in(raw.field_data, "units") or "kPa")
+    if units is not None and units.mm != 1.0:
+        raw = raw._replace(points=raw.points * units.mm)
     try:
         kind = kind_of_cells(raw.cells)
         n = CELL_DIMENSIONS[kind]
@@ -130,11 +133,11 @@ def _numbers(
         fields.append(numbers)
     units = text_in(raw.field_data, "units") or "kPa"
     if units in STRESS_UNITS:
-        fields = [stresses_times(STRESS_UNITS[units].kPa, each) for each in fields]
+        fields = [scaled_fields(each, STRESS_UNITS[units].kPa, STRESS_UNITS[units].mm, ndim) for each in fields]
     elif lost := [name for each in fields for name in each if is_stress(name)]:
         lost += ["nu", "material", "density"] if "young" in lost else []
         fields = [{name: values for name, values in each.items() if name not in lost} for each in fields]
-        words = f'unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"'
+        words = f'unit is none of {", ".join(STRESS_UNITS)}: "{units}"'
         notes.append(f"dropped moduli and stresses, as their {words}")
     if raw.space == "lps" and ndim == 3:
         fields = [half_turned_fields(each) for each in fields]

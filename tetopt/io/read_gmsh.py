@@ -121,7 +121,7 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in only one group
         sets += [Group(name, side, of_set) for name, of_set in _members(raw, side, comments.facets).items()]
     labels_of_sets = {each.label for each in sets}
-    dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
+    dropped = ("gmsh:physical", "gmsh:geometrical")
     return raw._replace(
         cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
         field_data=raw.field_data | {name: np.array([text]) for name, text in comments.texts.items()},

@@ -16,7 +16,7 @@ from tetopt.interop.conversions import checked_fields
 from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
-from tetopt.model.model import SPACES, Model, half_turn
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, half_turn
 from tetopt.model.sets import MOST_LETTERS, SET_NAME
 from tetopt.system.public import checked_simplices
 
@@ -99,7 +99,7 @@ def save_surface(
         raise InputError(f"space: expected {' or '.join(SPACES)}, got {plain(space)}")
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
-    whole = writers[path.suffix.lower()](surface, about, space, labels)
+    whole = writers[path.suffix.lower()](surface, f"mm {about}", space, labels)
     save_checked(path, whole)
 
 
@@ -128,11 +128,11 @@ def boundary_ply(model: Model) -> bytes:
 
 
 def _boundary(model: Model) -> tuple[Surface, str, str]:
-    """Return the surface, a text for its file, and the space of its points."""
+    """Return the surface, a text for its file that begins with the unit of length, and the space of its points."""
     if model.mesh.ndim != 3:
         raise InputError("surface: expected a tetrahedral mesh, got triangles")
     surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
-    return surface, str(model.about.get("image", "")), model.space
+    return surface, f"{STRESS_UNITS[model.units].length} {model.about.get('image', '')}", model.space
 
 
 def checked_surface(path: str | Path) -> SurfaceCheck:
@@ -193,7 +193,7 @@ def _ascii_line(about: str) -> str:
 
 def _stl(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     # A binary file must not begin with "solid", by which some readers recognise text files.
-    header = f"tetopt {SPACE_KEY}{space.upper()} mm {_ascii_line(about)}".encode()[:80].ljust(80)
+    header = f"tetopt {SPACE_KEY}{space.upper()} {_ascii_line(about)}".encode()[:80].ljust(80)
     triangles = np.zeros(len(surface.triangles), dtype=STL_TRIANGLE)
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -207,7 +207,7 @@ def _ply(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
         "ply",
         "format binary_little_endian 1.0",
         f"comment {SPACE_KEY}{space.upper()}",
-        f"comment tetopt; mm; {_ascii_line(about)}".rstrip("; "),
+        f"comment tetopt; {_ascii_line(about)}",
         f"element vertex {len(surface.points)}",
         *(f"property double {axis}" for axis in "xyz"),
         f"element face {len(surface.triangles)}",
@@ -234,7 +234,7 @@ def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
 
     writer = vtkPolyDataWriter()
-    writer.SetHeader(f"tetopt, mm, {SPACE_KEY}{space.upper()} {_ascii_line(about)}"[:250])  # a line of 256 characters
+    writer.SetHeader(f"tetopt, {SPACE_KEY}{space.upper()} {_ascii_line(about)}"[:250])  # a line of 256 characters
     writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
     return written_bytes(writer, _grid(surface, labels))

@@ -31,7 +31,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
 from tetopt.model.file import text_in
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, elements, grid_fields
+from tetopt.model.model import STRESS_UNITS, Model, elements, grid_fields
 from tetopt.model.sets import SET_NAME, Box, Sets, is_set
 from tetopt.system.incoming import json_of
 
@@ -62,7 +62,7 @@ def vtk(model: Model) -> bytes:
         for name in data:
             data[name] = _without_int64(np.asarray(data[name]))
     writer = vtkUnstructuredGridWriter()
-    writer.SetHeader(f"tetopt, mm, SPACE={model.space.upper()}")
+    writer.SetHeader(f"tetopt, {STRESS_UNITS[model.units].length}, SPACE={model.space.upper()}")
     writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
     return written_bytes(writer, grid)
@@ -119,7 +119,8 @@ def model_grid(model: Model) -> vtkUnstructuredGrid:
     texts = dict(model.about) | {"space": model.space}
     if model.materials is not None and model.materials.binning is not None:
         texts["binning"] = model.materials.binning._asdict()
-    if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):
+    has_stresses = any(map(is_stress, [*model.cell_data, *model.point_data]))
+    if model.materials is not None or model.loads or has_stresses or STRESS_UNITS[model.units].mm != 1.0:
         texts["units"] = model.units
     if model.loads:
         texts["loads"] = [load_words(load) for load in model.loads]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,7 @@ from tetopt.model.fields import is_stress
 from tetopt.model.file import MATERIAL_FIELDS, MeshFile, with_labels, without_results
 from tetopt.model.labels import kept_labels, labels_of
 from tetopt.model.model import Model
-from tetopt.model.sets import INTERFACE_PREFIX, Sets, box_of, box_text, merged_sets
+from tetopt.model.sets import INTERFACE_PREFIX, Sets, box_of, box_text, merged_sets, standard_names
 from tetopt.report.summary import model_summary, versions
 
 
@@ -124,7 +125,12 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
     more = f"; their interfaces are sets: {listed(left)}" if left else ""
     note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")
-    return part
+    for name, rows in loaded.sets.facets.items():
+        count = len(part.sets.facets.get(name, ()))
+        if count < len(rows) and name not in standard_names(loaded.mesh.ndim) and not name.startswith(INTERFACE_PREFIX):
+            warning(f'set "{name}" keeps {count} of its {len(rows)} facets; the others are on labels left out')
+    inputs = loaded.table("inputs") | {"kept_labels": kept, "mask": None, "background": None}  # of all labels
+    return part._replace(field_data=part.field_data | {"inputs": np.array([json.dumps(inputs)])})
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class Judgement(NamedTuple):
     def is_masked(self) -> bool:
         """True if the mesh was built within a mask or without a background."""
         inputs = self.loaded.table("inputs")
-        was_masked = any(inputs.get(name) is not None for name in ("mask", "background"))
+        was_masked = any(inputs.get(name) is not None for name in ("mask", "background", "kept_labels"))
         is_masked = self.source is not None and self.source.mask is not None
         return was_masked or is_masked or MASK_TEXT in self.loaded.field_data
 
@@ -164,7 +164,7 @@ def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
     tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
-    weights = inputs.get("weights")
+    weights, filled = inputs.get("weights"), inputs.get("filled_holes")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
         images=[image], labels=labels, mask=part.mask, mask_label=part.mask_label,
@@ -173,10 +173,18 @@ def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
+        keep_labels=None if labels is None else _labels_kept(inputs),
+        fill_holes=None if labels is None or not isinstance(filled, int) else str(filled),
     )  # fmt: skip
     names = None if part.mask_label is None else names
     numbers = None if labels is None else _merged(inputs, labels, part)
     return read_source(options, names, numbers=numbers, loaded=loaded)
+
+
+def _labels_kept(inputs: Mapping[str, Any]) -> str | None:
+    """Return the labels that the mesh's run kept, if it left out others."""
+    kept = inputs.get("kept_labels")
+    return ",".join(map(str, kept)) if isinstance(kept, list) and kept else None
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:

@@ -17,7 +17,7 @@ import tetopt
 from tetopt.errors import InputError, Remark, error_words
 from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
-from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_model
+from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import label_table
@@ -28,7 +28,7 @@ from tetopt.model.build import build_model
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MATERIAL_FIELDS, MeshFile, completed, loads_in, moduli_in, sets_beside, without_results
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
-from tetopt.model.loads import FACET_FORCES, check_steps, known_set, other_orders, parse_load
+from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
 from tetopt.model.mappings import parse_any_mapping
 from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, odd_units
@@ -48,6 +48,7 @@ from tetopt.model.sets import (
 from tetopt.system.files import kept_places
 
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
+MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
 # Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the cells.
 MANY_INTERFACES = 24
@@ -73,6 +74,9 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         raise InputError("`average`: needs `young`")
     if solver.units not in STRESS_UNITS:
         raise InputError(f"`units`: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
+    if solver.fields is not None and (solver.fields not in FIELDS or not form.fields):
+        able = ", ".join(name for name, kind in FORMATS.items() if kind.fields)
+        raise InputError(f"`fields`: expected {', '.join(FIELDS)} and a file {able}, got {solver.fields} for {output}")
     if solver.space not in SPACES:
         raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {solver.space}")
     if solver.nonlinear and not form.has_large:
@@ -289,8 +293,7 @@ def check_early(
             names_in(request, known)
         known = Sets(known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells)
     for name in loaded:
-        may_come = name.startswith(INTERFACE_PREFIX) and not other_orders(name, model.sets)
-        if name and name not in names and not may_come:
+        if name and name not in names and not name.startswith(INTERFACE_PREFIX):
             known_set(name, model.sets)
     for load in loads:
         if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
@@ -318,7 +321,13 @@ def warn_of_units(model: Model) -> None:
 
 
 def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
-    """Write the file."""
+    """Write the file with the fields of cells that the options or the format choose."""
+    choice = solver.fields or format_of(output).fields or "all"  # a format without a place for them lists them
+    names = [name for name in model.cell_data if name != "label" and not is_result(name)]
+    left = [name for name in names if choice == "none" or (choice == "mean" and not re.fullmatch(MEAN_FIELD, name))]
+    if left and solver.fields is None:
+        note(f"{output}: {len(left)} fields of cells are not written (`fields` all writes them): {', '.join(left)}")
+    model = model._replace(cell_data={name: rows for name, rows in model.cell_data.items() if name not in left})
     if model.materials is not None and len(model.materials.young) > SLOW_MATERIALS and output.suffix.lower() == ".inp":
         note(f"{len(model.materials.young)} materials make CalculiX about three times slower; `bins` 32 groups them")
     save_model(output, model, space=solver.space, units=solver.units)

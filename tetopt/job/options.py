@@ -164,6 +164,10 @@ class RegionOptions(LabelChoice):
             "VALUE|auto", "Leave out the air: voxels up to VALUE connected to the box's sides. Labels above 0 stay."
         ),
     ] = None
+    fill_holes: Annotated[
+        str | None,
+        Option("LABEL", "Give this label, a number or name, to voxels of label 0 that other labels enclose."),
+    ] = None
     keep_components: Annotated[bool, Option(None, "Keep small components of the mesh that the mask does not have.")] = (
         False
     )
@@ -415,7 +419,16 @@ class SolverOptions(ModelOptions):
     """Settings of a solver's file."""
 
     nonlinear: Annotated[bool, Option(None, "Make the step a large-deformation one (.inp; FEBio always does).")] = False
-    units: Annotated[str, Option("kPa|MPa", "Unit of stress in the file; `young` is in kPa.")] = "kPa"
+    units: Annotated[
+        str, Option("kPa|MPa|Pa", "Unit of stress in the file; with Pa, lengths are in m. `young` is in kPa.")
+    ] = "kPa"
+    fields: Annotated[
+        str | None,
+        Option(
+            "none|mean|all",
+            "Fields of cells to write besides labels and results (default none in .msh; all in .vtu, .vtk, .xdmf).",
+        ),
+    ] = None
     space: SpaceOption = "ras"
 
 

@@ -216,7 +216,7 @@ def _check_source(job: JobOptions) -> None:
     if job.merge is not None and job.labels is None:
         raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
-        names = ("keep_labels", "drop_labels", "label_names", "label_weight", "smooth_interfaces")
+        names = ("keep_labels", "drop_labels", "fill_holes", "label_names", "label_weight", "smooth_interfaces")
         for name in (*names, "cells_across", "label_size"):
             if getattr(job, name) is not None and not (name == "label_names" and job.mask_label is not None):
                 raise InputError(f"`{name}`: needs `labels`")

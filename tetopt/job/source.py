@@ -10,15 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.align import KEEP_PIECES, background_level, foreground, resample_contrast, resample_labels
+from tetopt.contents.align import (
+    KEEP_PIECES,
+    background_level,
+    filled_holes,
+    foreground,
+    resample_contrast,
+    resample_labels,
+)
 from tetopt.contents.content import Content, content, continued
 from tetopt.contents.domain import INSIDE_FRACTION, mask_text
-from tetopt.contents.labels import BACKGROUND_LABEL
+from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.io.text import counted
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
     Align,
@@ -43,7 +51,7 @@ from tetopt.measure.fidelity import cell_labels, unexplained_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import TABLE_TEXT, kept_labels, label_words, table_of_labels, table_words
+from tetopt.model.labels import TABLE_TEXT, kept_labels, label_words, labels_named, table_of_labels, table_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
 
@@ -134,7 +142,8 @@ def read_source(
         finest = {**finest, key: read_companion(options.labels, options.spacing_mm)}
     image, beside, factors = image_and_others(read_image(paths[0], options), paths[0], options, finest)
     labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
-    if labels is not None and is_own and numbers:
+    labels, filled = _without_holes(options, labels, table)
+    if labels is not None and is_own and (numbers or filled is not None):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     level = None
@@ -170,6 +179,7 @@ def read_source(
         **({"divided": factors} if max(factors) > 1 else {}),
         **({} if mask is None else {"keep_components": options.keep_components}),
         **({} if kept is None else {"kept_labels": kept}),
+        **({} if filled is None else {"filled_holes": filled}),
         "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
     about = {
@@ -181,6 +191,36 @@ def read_source(
     }
     source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
     return source.with_table(table)
+
+
+def _without_holes(
+    options: SourceOptions, labels: Image | None, table: LabelTable
+) -> tuple[Image | None, int | None]:  # fmt: skip
+    """Return the labels, and the label that enclosed voxels of label 0 have got, if any; report these."""
+    if options.fill_holes is None:
+        return labels, None
+    assert labels is not None, "the plan requires labels"
+    label = _label_of_holes(options.fill_holes, table)
+    filled, sizes = filled_holes(labels, label)
+    if len(sizes):
+        size = float(np.prod(labels.spacing))
+        largest = f", the largest {sizes[0] * size:.4g}" if len(sizes) > 1 else ""
+        words = f"{counted(len(sizes), 'hole')} of {sizes.sum() * size:.4g} mm{labels.ndim}{largest}"
+        note(f"label 0: {words}, filled by {label_words(label, table.names)}")
+    else:
+        warning("`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the box's sides")
+    return filled, label
+
+
+def _label_of_holes(text: str, table: LabelTable) -> int:
+    """Parse the label that holes get."""
+    try:
+        (label, *others) = labels_named(text, table.names)
+    except InputError as error:
+        raise InputError(f"`fill_holes`: {error}") from error
+    if others or not BACKGROUND_LABEL < label <= LARGEST_LABEL:
+        raise InputError(f'`fill_holes`: expected one label from 1 to {LARGEST_LABEL}, got "{text}"')
+    return label
 
 
 def _chosen(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, continued
 from tetopt.contents.domain import mask_text
+from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
@@ -40,7 +41,7 @@ from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_r
 
 
 def build_model(
-    mesh: Mesh | MeshFile,
+    mesh: Mesh | MeshFile | MeshingResult,
     image: Image | Content | None = None,
     *,
     young: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
@@ -61,13 +62,15 @@ def build_model(
 
     Parameters
     ----------
-    mesh : Mesh or MeshFile
-        The contents of a file (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
+    mesh : Mesh, MeshFile or MeshingResult
+        A result of `mesh_image` comes with the image, mask and labels that it was made from. The contents of a file
+        (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
         nodes, labels and their names, sets, moduli, loads, the image's box, and strings on its origin. Solver results
         are kept if moduli and loads are.
     image : Image or Content, optional
         Mappings are applied to its intensities, and the faces of its box become sets. For a mesh of a content, pass the
-        content: its first contrast counts, and no voxel outside its mask. A MeshFile knows its mask.
+        content: its first contrast counts, and no voxel outside its mask. A MeshFile knows its mask; a MeshingResult
+        has its content and takes no image.
     young, nu : number, (M,) array, mapping or str, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one per cell, or
         a mapping of the intensity or of the label (`tetopt.model.mappings.parse_any_mapping`). With an image, a mapping
@@ -111,7 +114,8 @@ def build_model(
     Raises
     ------
     InputError
-        For the reasons of the functions named above; an invalid dimension or order; gravity without a density.
+        For the reasons of the functions named above; an invalid dimension or order; gravity without a density; an
+        image beside a result of `mesh_image`.
 
     Warns
     -----
@@ -125,19 +129,22 @@ def build_model(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+    >>> result = tetopt.mesh_image(image, 300, iterations=8)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> model = tetopt.build_model(result, young="0.1*h", nu=0.45, loads=loads, order=2)
     >>> tetopt.save_model("ball.inp", model)  # for CalculiX or Abaqus
 
     Moduli by label:
 
     >>> labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> data = {"label": tetopt.cell_labels(labels, mesh)}
     >>> tetopt.build_model(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
     [2.0, 10.0]
     """
     loaded, loads = None, tuple(loads)
+    if isinstance(mesh, MeshingResult):
+        mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
     if isinstance(mesh, MeshFile):
         loaded, is_of_file = _to_be_kept(mesh, [young, nu, density, bins], loads), young is None and bins is None
@@ -149,8 +156,7 @@ def build_model(
         loads = loads or _said(loads_in(loaded))
         box = loaded.box if box is None else box
         about = _texts_of(loaded, box) | about
-    order = 1 if order is None else order
-    if order not in (1, 2):
+    if (order := 1 if order is None else order) not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(average)
     if image is not None and image.ndim != mesh.ndim:
@@ -158,8 +164,7 @@ def build_model(
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
     labels = labels_of(cell_data, len(mesh.cells))
     about = _with_table_in_words(about, labels)
-    mean = cell_data.get("mean")
-    mean = mean if mean is not None and mean.ndim == 1 else None
+    mean = means if (means := cell_data.get("mean")) is not None and means.ndim == 1 else None
     cells = _ModelCells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
     if known_sets is None:
         box = box_of(whole) if box is None and whole is not None else box
@@ -179,6 +184,22 @@ def build_model(
         density_of(table)  # raises InputError without a density
     model = Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=about)
     return model if loaded is None else _said(completed(model, loaded, is_of_file=is_of_file))
+
+
+def _of_result(
+    result: MeshingResult, image: Image | Content | None, order: int | None, cell_data: dict[str, NDArray] | None
+) -> tuple[Mesh, Content, int | None, dict[str, NDArray]]:
+    """Return a result's mesh, content, order, if its edges are curved, and data of cells, unless given."""
+    mesh, content = result.mesh, result.content
+    if image is not None or content is None:
+        raise InputError(
+            "build_model: expected a result of `mesh_image` without an image, as it has its own; pass `result.mesh` "
+            "with an image instead"
+        )
+    if cell_data is None:
+        labels = {} if result.labels is None else {"label": result.labels}
+        cell_data = cell_fields(mesh, content) | labels
+    return mesh, content, 2 if order is None and mesh.midpoints is not None else order, cell_data
 
 
 def _voxels(

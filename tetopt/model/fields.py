@@ -128,9 +128,12 @@ def is_stress(name: str) -> bool:
     return _base_name(name) in STRESS_FIELDS
 
 
-def stresses_times(factor: float, fields: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Convert moduli and stresses among named fields to another unit."""
-    return {name: values * factor if is_stress(name) else values for name, values in fields.items()}
+def scaled_fields(fields: dict[str, NDArray], stress: float, length: float, ndim: int) -> dict[str, NDArray]:
+    """Convert moduli, stresses, displacements and volumes among named fields to other units, given as the number of
+    new units per present unit."""
+    factors = dict.fromkeys(STRESS_FIELDS, stress) | dict.fromkeys(VECTOR_FIELDS, length) | {"volume": length**ndim}
+    scales = {name: factors.get(_base_name(name), 1.0) for name in fields}
+    return {name: values if scales[name] == 1.0 else values * scales[name] for name, values in fields.items()}
 
 
 def _base_name(name: str) -> str:

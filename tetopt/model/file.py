@@ -255,9 +255,9 @@ def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
         return [], ""
     if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
         return [], f"dropped the file's loads: it no longer has the sets {', '.join(lost)}"
-    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
+    units = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"])
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scaled(load, factor)) for load in turned], ""
+    return [load_words(scaled(load, units.kPa, units.mm)) for load in turned], ""
 
 
 def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any) -> tuple[Any, Any, Any]:

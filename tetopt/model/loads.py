@@ -27,6 +27,7 @@ from tetopt.model.sets import (
     facet_triples,
     finite_numbers,
     nodes_of,
+    place_of,
 )
 
 PLANE_FRACTION = 1.0 - 1e-6  # the sum of area vectors of a flat set is at least this fraction of its area
@@ -223,28 +224,21 @@ def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def known_set(name: str, sets: Sets) -> str:
-    """Return the name of a facet set after checking it.
+    """Return the name of the facet set that a load names, in any case, or from an interface's other side.
 
     Raises
     ------
     InputError
         No facet set has this name.
     """
-    if name in sets.facets:
-        return name
+    if (place := place_of(name, sets)) is not None:
+        return place[0]
     if name in sets.cells:
         first = ", ".join(list(sets.facets)[:8])
         raise InputError(f'load: "{name}" is a set of cells; give a set of facets, such as {first}')
-    similar = [each for each in sets.facets if each.lower() == name.lower()] or other_orders(name, sets)
-    similar = similar or difflib.get_close_matches(name, sets.facets, 1)
+    similar = difflib.get_close_matches(name, sets.facets, 1)
     hint = f"did you mean {similar[0]}?" if similar else f"known sets are {', '.join(sets.facets)}"
     raise InputError(f'load: no set of facets "{name}"; {hint}')
-
-
-def other_orders(name: str, sets: Sets) -> list[str]:
-    """Return facet sets with the same words in another order, as for an interface named from its other side."""
-    words = sorted(name.lower().split("_"))
-    return [each for each in sets.facets if each != name and sorted(each.lower().split("_")) == words]
 
 
 def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:

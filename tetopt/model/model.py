@@ -13,7 +13,7 @@ from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.mesh import Mesh
-from tetopt.model.fields import GAUSS_MODULI, HALF_TURN, NODE_MODULI, half_turned_fields, node_field, stresses_times
+from tetopt.model.fields import GAUSS_MODULI, HALF_TURN, NODE_MODULI, half_turned_fields, node_field, scaled_fields
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
@@ -26,16 +26,22 @@ if TYPE_CHECKING:
 
 
 class Units(NamedTuple):
-    """Units consistent with mm, s and a unit of stress."""
+    """A consistent system of units with s."""
 
     kPa: float  # per unit of stress
+    length: str
+    mm: float  # per unit of length
     force: str
     energy: str
     mass: str
     water: float  # density
 
 
-STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
+STRESS_UNITS = {
+    "kPa": Units(1.0, "mm", 1.0, "mN", "uJ", "kg", 1e-6),
+    "MPa": Units(1e3, "mm", 1.0, "N", "mJ", "t", 1e-9),
+    "Pa": Units(1e-3, "m", 1e3, "N", "J", "kg", 1e3),
+}
 WATER_DENSITY = 1000.0  # kg/m3
 # Values a thousand times off from any tissue are most likely in another unit. Soft tissue has 0.1 to a few hundred kPa:
 # in Pa it lies within the first range, where otherwise only cartilage does, and in MPa it lies below the third number.
@@ -49,12 +55,12 @@ ON_PREFIX, IN_PREFIX = "on_", "in_"  # prefixes of data that are 1 on the nodes 
 
 
 class Model(NamedTuple):
-    """A mesh with everything that is written for a solver. Lengths in mm; moduli in `units`.
+    """A mesh with everything that is written for a solver.
 
     Parameters
     ----------
     mesh : Mesh
-        Points in mm, in the axes of `space`.
+        Points in mm, with `units` "Pa" in m, in the axes of `space`.
     cell_data : dict of arrays
         By name, one row per cell.
     sets : Sets
@@ -65,8 +71,8 @@ class Model(NamedTuple):
         Supports, displacements, pressures, tractions, springs, gravity.
     order : {1, 2}
         2: quadratic cells, with straight edges unless the mesh has midpoints, see `tetopt.geometry.quadratic`.
-    units : {"kPa", "MPa"}
-        Unit of moduli and pressures.
+    units : {"kPa", "MPa", "Pa"}
+        Unit of moduli and pressures, see `STRESS_UNITS`.
     space : {"ras", "lps"}
         "lps": the signs of x and y are reversed.
     node_young : (N,) float64, optional
@@ -225,7 +231,7 @@ def half_turned(load: Load) -> Load:
 
 
 def in_units(model: Model, units: str) -> Model:
-    """Convert moduli, pressures, tractions and springs to another unit of stress, kPa or MPa.
+    """Convert lengths, moduli and loads to other units, see `STRESS_UNITS`.
 
     Raises
     ------
@@ -236,22 +242,27 @@ def in_units(model: Model, units: str) -> Model:
         raise InputError(f"units: expected {' or '.join(STRESS_UNITS)}, got {units}")
     if units == model.units:
         return model
-    factor = STRESS_UNITS[model.units].kPa / STRESS_UNITS[units].kPa
-    table = model.materials
+    old, new, mesh, table = STRESS_UNITS[model.units], STRESS_UNITS[units], model.mesh, model.materials
+    stress, length = old.kPa / new.kPa, old.mm / new.mm
+    if length != 1.0:
+        middles = None if mesh.midpoints is None else mesh.midpoints * length
+        mesh = Mesh(mesh.points * length, mesh.cells, middles)
     return model._replace(
-        materials=None if table is None else table._replace(young=table.young * factor),
-        loads=tuple(scaled(load, factor) for load in model.loads),
-        node_young=None if model.node_young is None else model.node_young * factor,
-        gauss_young=None if model.gauss_young is None else model.gauss_young * factor,
-        cell_data=stresses_times(factor, model.cell_data),
-        point_data=stresses_times(factor, model.point_data),
+        mesh=mesh,
+        materials=None if table is None else table._replace(young=table.young * stress),
+        loads=tuple(scaled(load, stress, length) for load in model.loads),
+        node_young=None if model.node_young is None else model.node_young * stress,
+        gauss_young=None if model.gauss_young is None else model.gauss_young * stress,
+        cell_data=scaled_fields(model.cell_data, stress, length, mesh.ndim),
+        point_data=scaled_fields(model.point_data, stress, length, mesh.ndim),
         units=units,
     )
 
 
-def scaled(load: Load, factor: float) -> Load:
-    """Convert a load to a unit of stress; `factor` is the number of new units per present unit."""
-    return load._replace(numbers=load.numbers * factor) if load.kind in FACET_FORCES else load
+def scaled(load: Load, stress: float, length: float) -> Load:
+    """Convert a load to other units; `stress` and `length` are the numbers of new units per present unit."""
+    factor = stress if load.kind in FACET_FORCES else length
+    return load._replace(numbers=load.numbers * (factor / length if load.kind == "spring" else factor))
 
 
 def odd_units(model: Model) -> Iterator[str]:
@@ -290,10 +301,11 @@ def locking_words(model: Model) -> str:
 def described(model: Model) -> list[str]:
     """Return lines for a file's header: the writer, coordinates, units and inputs."""
     units = STRESS_UNITS[model.units]
+    space = f"{model.space.upper()}+" if model.mesh.ndim == 3 else "of the slice's plane"
     lines = [
         f"tetopt {model.about.get('tetopt', '')}".strip(),
-        f"coordinates: {model.space.upper()}+, mm" if model.mesh.ndim == 3 else "coordinates: of the slice's plane, mm",
-        f"units: mm, {model.units}, {units.force}, {units.energy}, {units.mass}, s",
+        f"coordinates: {space}, {units.length}",
+        f"units: {units.length}, {model.units}, {units.force}, {units.energy}, {units.mass}, s",
     ]
     if "image" in model.about:
         lines.append(f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}")
@@ -311,7 +323,7 @@ def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:
-    """Return the density of each material, (K,), in the model's unit of mass per mm3; water's if there is none."""
+    """Return the density of each material, (K,), in the model's units of mass and length; water's if there is none."""
     assert model.materials is not None
     density, water = model.materials.density, STRESS_UNITS[model.units].water
     return np.full(len(model.materials.young), water) if density is None else density / WATER_DENSITY * water

@@ -421,7 +421,7 @@ def names_in(request: SetRequest, sets: Sets) -> list[str]:
     """Return the names in "A-B-C"; as a name may contain "-", the longest known ones."""
     parts, names = request.difference.split("-"), []
     while parts:
-        known = (k for k in range(len(parts), 0, -1) if _place_of("-".join(parts[:k]).strip(), sets) is not None)
+        known = (k for k in range(len(parts), 0, -1) if place_of("-".join(parts[:k]).strip(), sets) is not None)
         if (k := next(known, None)) is None:
             raise InputError(
                 f'set {request.name}: no set of facets begins "{"-".join(parts).strip()}"; the mesh has '
@@ -432,7 +432,7 @@ def names_in(request: SetRequest, sets: Sets) -> list[str]:
     return names
 
 
-def _place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
+def place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
     """Return the set of facets of this name, in any case, and whether it names its labels in the other order."""
     for known in sets.facets:
         if known.lower() == name.lower():
@@ -451,7 +451,7 @@ def _turned_names(name: str) -> list[str]:
 
 
 def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
-    place = _place_of(name, sets)
+    place = place_of(name, sets)
     assert place is not None, f"{request.name}: {name} is split by known names"
     rows = sets.facets[place[0]]
     return rows_of(mesh, facet_triples(mesh.cells, rows)[:, ::-1]) if place[1] else rows
