@@ -136,7 +136,18 @@ def test_json_of_a_run(run, inputs):
     assert (options["method"], options["n_t"], options["retessellate"]) == ("paper", 1, "first")
     assert (options["nodes"], options["lattice"], options["boundary"]) == (150, "bcc", "slide")
     assert (options["k_D"], options["iterations"]) == (0.3, 3)
-    for name in ("spacing", "volume", "crop", "slice", "start", "max_seconds", "max_gb", "target_error", *SIZES):
+    for name in (
+        "spacing",
+        "volume",
+        "crop",
+        "slice",
+        "start",
+        "max_seconds",
+        "max_gb",
+        "target_error",
+        "nodes_max",
+        *SIZES,
+    ):
         assert options[name] is None
     assert numbers["versions"]["tetopt"] == tetopt.__version__
     assert numbers["versions"]["numba"] == numba.__version__
@@ -989,6 +1000,44 @@ def test_target_error(tmp_path, inputs, capfd):
     capfd.readouterr()
     assert exit_code(*command, "--force", "--target-error", "0.01", "--size-min", "32") == 1
     assert "of the image's variance is unexplained, more than 0.01" in capfd.readouterr().err
+
+
+def test_target_error_with_the_most_nodes(tmp_path, capfd):
+    """What the error takes is said before the run with the most nodes, which is that of as many; what it left, then."""
+    x, y = np.indices((120, 100))
+    save_image(tmp_path / "a.nii.gz", Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x))
+    command = mesh_words(tmp_path / "a.nii.gz", tmp_path)
+    assert exit_code(*command, "--target-error", "0.001", "--nodes-max", "230") == 1
+    numbers, err = numbers_in(tmp_path / "a.json"), " ".join(capfd.readouterr().err.split())
+    (first, left), (last, reached) = re.findall(r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err)
+    pattern = r"an error of 0.001 takes about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
+    ((predicted, words),) = re.findall(pattern, err)
+    assert (int(first), int(last), words) == (200, 230, "more than --nodes-max, so that the next run has 230 nodes")
+    assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / 0.7), rel=0.01)
+    assert err.index(words) < err.index(f"{last} nodes leave")
+    assert f"{reached} of the image's variance is unexplained, more than 0.001, which takes about " in err
+    assert "allow more (--nodes-max)" in err
+    options = numbers["options"]
+    assert list(numbers["violated"]) == ["error"]
+    assert (options["nodes"], options["nodes_max"], numbers["size"]["n_nodes"]) == (230, 230, 230)
+    assert exit_code(*command, "--force", "--nodes", 230) == 0
+    assert numbers_in(tmp_path / "a.json")["mesh_sha256"] == numbers["mesh_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--nodes-max 300", "--nodes-max: needs --target-error"),
+        ("--nodes-max 300 --nodes 200", "--nodes-max: needs --target-error"),
+        ("--nodes-max 300 --spacing 9", "--nodes-max: needs --target-error"),
+        ("--nodes-max 4 --target-error 0.2", "--nodes-max: expected 5 or more, got 4"),
+        ("--nodes-max 8 --target-error 0.2", "--nodes-max: expected a whole number, 9 or more in 3-D, got 8"),
+        ("--nodes-max 60 --target-error 0.2 --edge-max 9", "--nodes-max: sizes take"),
+    ],
+)
+def test_the_most_nodes_are_those_for_an_error(tmp_path, inputs, capfd, options, words):
+    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *options.split()]
+    assert_refused(capfd, command, words)
 
 
 # --------------------------------------------------------------------------------------------------

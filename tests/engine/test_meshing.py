@@ -10,7 +10,7 @@ import pytest
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.engine.meshing import Aim, MeshSearch, sizes_of_order
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import node_count, quadratic
 from tetopt.start.clip import lattice_within
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
@@ -116,6 +116,28 @@ def test_longest_edge_of_order_2():
         tetopt.mesh_image(IMAGE, 100, order=3)
 
 
+@pytest.mark.parametrize(("order", "nodes_max", "n_runs"), [(1, 150, 1), (1, 260, 2), (2, 950, 2)])
+def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
+    """With their mesh, and the error that it leaves, if the target takes more; no run has more."""
+    x, y = np.indices((120, 100))
+    image = tetopt.Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x)
+    aim, attempts, counts = Aim(target_error=0.001, order=order, nodes_max=nodes_max), [], []
+    search = MeshSearch(image, aim, iterations=3)
+    for attempt in search:
+        attempts.append(attempt)
+        search.tell(result := attempt.run())
+        counts.append(node_count(result.mesh.points, result.mesh.cells, order))
+    assert len(attempts) == n_runs
+    assert attempts[0].predicted is None
+    assert all(each.predicted > len(search.result.mesh.points) for each in attempts[1:])
+    assert abs(counts[-1] / nodes_max - 1.0) <= (0.01 if order == 2 else 0.0)
+    assert counts == sorted(counts)
+    assert search.result.fraction > 0.001
+    assert search.result.violated["error"].startswith(f"{search.result.fraction:.4g} of the image's variance is")
+    if order == 1:
+        assert_same(search.result, tetopt.mesh_image(image, nodes_max, iterations=3))
+
+
 def test_by_the_paper():
     result = tetopt.mesh_image(IMAGE, mode="paper", spacing=16.0, iterations=2, n_t=1)
     lattice = tetopt.lattice_mesh(IMAGE, spacing=16.0)
@@ -152,11 +174,23 @@ def test_a_search_by_attempts():
     ("arguments", "words"),
     [
         ({"mode": "coarse"}, "expected mode graded, uniform, paper, start, got 'coarse'"),
-        ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, not kind"),
+        ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, nodes_max, sizes, not kind"),
         ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, not sizes"),
         ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
         ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give only one of nodes and spacing"),
         ({"mode": "start"}, "requires a mesh to start from"),
+        ({"nodes": 100, "nodes_max": 200}, "nodes_max needs target_error"),
+        ({"nodes_max": 200}, "nodes_max needs target_error"),
+        ({"target_error": 0.2, "nodes_max": 8}, "nodes_max: expected a whole number, 9 or more in 3-D, got 8"),
+        ({"target_error": 0.2, "nodes_max": 64, "order": 2}, "nodes_max: expected a whole number, 65 or more in 3-D"),
+        (
+            {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(edge_size=9.0)},
+            r"nodes_max: sizes take \d+ nodes or more, got 500; allow as many, or larger cells",
+        ),
+        (
+            {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(longest=9.0)},
+            r"nodes_max: sizes take \d+ nodes or more, got 500",
+        ),
     ],
 )
 def test_contradictions(arguments, words):

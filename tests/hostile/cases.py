@@ -596,7 +596,8 @@ SOLVER_OPTIONS = {
 }  # fmt: skip
 OPTIONS = {
     "mesh": {
-        "--nodes": WHOLE, "--target-error": REAL, "--size-min": REAL, "--edge-size": REAL, "--edge-max": REAL,
+        "--nodes": WHOLE, "--target-error": REAL, "--nodes-max": WHOLE,
+        "--size-min": REAL, "--edge-size": REAL, "--edge-max": REAL,
         "--gradation": REAL, "--lattice": WORD, "--spacing": REAL,
         "--k-d": REAL, "--boundary": WORD, "--method": WORD, "--shape-power": REAL, "--min-dihedral": REAL,
         "--n-t": WHOLE, "--retessellate": WORD, "--threads": WHOLE,
@@ -616,7 +617,8 @@ OPTIONS = {
 
 # What is taken where the rest of the line is sound: not everything should be refused at its first word.
 PLAUSIBLE = {
-    "--nodes": ("9", "30", "80"), "--target-error": ("0.5", "0.9"), "--size-min": ("1", "5"),
+    "--nodes": ("9", "30", "80"), "--target-error": ("0.5", "0.9"), "--nodes-max": ("40", "90"),
+    "--size-min": ("1", "5"),
     "--edge-size": ("6", "12"),
     "--edge-max": ("9", "20"), "--gradation": ("0.3", "1"), "--lattice": ("bcc", "five-tet", "octree"),
     "--spacing": ("6", "9"),

@@ -22,7 +22,8 @@ from tetopt.start.label_sizes import LabelSize
 VALUES = {
     "images": [Path("/a/-b.nii"), Path("/c.nii")], "mask": Path("/m.nii"), "background": "-5", "labels": Path("/l.nii"),
     "weights": "1,2", "smooth_interfaces": 0.25, "label_weight": 2.0, "volume": 1, "crop": "1:9,:,:", "slice_": "k=3",
-    "nodes": 77, "target_error": 0.1, "size_min": 1.0, "edge_size": 9.0, "edge_max": 8.0, "gradation": 0.5,
+    "nodes": 77, "target_error": 0.1, "nodes_max": 99, "size_min": 1.0, "edge_size": 9.0, "edge_max": 8.0,
+    "gradation": 0.5,
     "sizing": Path("/s.nii"), "lattice": "octree", "uniform": True, "spacing": 3.0, "start": Path("/m.vtu"), "k_D": 0.3,
     "iterations": 3, "boundary": "fixed", "method": "paper", "shape_power": 2.0, "min_dihedral": 5.0, "n_t": 2,
     "retessellate": "never", "threads": 1, "max_seconds": 5.0, "max_gb": 3.0, "young": "0.5 + 0.01*h", "nu": "0.3",

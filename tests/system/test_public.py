@@ -44,8 +44,8 @@ RIGHT = {
     "mask_fidelity": {"mask": LABELS, "mesh": MESH},
     "merge_labels": {"labels": LABELS, "merge": "a=1; b=*", "names": {1: "c"}},
     "mesh_image": {
-        "image": IMAGE, "nodes": 100, "target_error": None, "start": None, "spacing": None, "sizes": None,
-        "mode": "graded",
+        "image": IMAGE, "nodes": 100, "target_error": None, "nodes_max": None, "start": None, "spacing": None,
+        "sizes": None, "mode": "graded",
     },
     "build_model": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
     "octree_mesh": {"image": IMAGE, "nodes": 100, "sizes": None},

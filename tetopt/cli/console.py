@@ -28,7 +28,7 @@ PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command l
         name: f"--{name.replace('_', '-').lower()}"
         for name in (
             "k_D", "min_dihedral", "shape_power", "target_error", "label_weight", "smooth_interfaces", "n_t",
-            "retessellate", "gradation", "boundary", "iterations", "nodes", "weights",
+            "retessellate", "gradation", "boundary", "iterations", "nodes", "nodes_max", "weights",
         )
     },
     "smallest": "--size-min", "edge_size": "--edge-size", "longest": "--edge-max", "field": "--sizing",

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from difflib import get_close_matches
 from functools import partial
-from math import prod
+from math import ceil, prod
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -31,13 +31,21 @@ from tetopt.engine.loop import (
     QUADRATIC_GRADATION,
     QUADRATIC_RATIO,
     START_K_D,
+    TARGET_NODES_MAX,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
     MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.requirements import checked_curved, requested, unexplained_by
+from tetopt.engine.requirements import (
+    ERROR_AIM,
+    ERROR_REACHED,
+    checked_curved,
+    nodes_ratio,
+    requested,
+    unexplained_by,
+)
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -70,18 +78,17 @@ MODE_DEFAULTS: dict[Mode, ModeDefaults] = {
     "start": ModeDefaults(START_K_D, UNIFORM_ITERATIONS, "fixed"),
 }
 MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the initial mesh
-    "graded": ("nodes", "target_error", "sizes"),
+    "graded": ("nodes", "target_error", "nodes_max", "sizes"),
     "uniform": ("nodes", "spacing", "kind"),
     "paper": ("nodes", "spacing", "kind"),
     "start": ("start",),
 }
-AIM_NAMES = ("nodes", "target_error", "spacing", "kind", "start", "sizes")  # in the order in which they are checked
+# In the order in which they are checked.
+AIM_NAMES = ("nodes", "target_error", "nodes_max", "spacing", "kind", "start", "sizes")
 QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
 NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
 FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
-ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000 nodes
-ERROR_REACHED = 0.85  # of the target error: a run from here up to the target ends the search
 CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
@@ -94,6 +101,7 @@ def mesh_image(
     labels: Image | None = None,
     mask: Image | None = None,
     target_error: float | None = None,
+    nodes_max: int | None = None,
     sizes: Sizes | None = None,
     order: int = 1,
     mode: Mode | None = None,
@@ -121,6 +129,9 @@ def mesh_image(
     target_error : float
         Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0 to 1. A few runs find
         the required number of nodes. `violated` reports a run that ends above the target.
+    nodes_max : int
+        With `target_error`, the most nodes to request, for order 2 including mid-edge nodes; by default 50,000. If the
+        target takes more, the mesh has these, and `violated` states the error that they reach.
     sizes : Sizes
         Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
         order 2 up to 1.15 times with a gradation of 0.5.
@@ -158,8 +169,9 @@ def mesh_image(
     ------
     InputError
         As for `optimize` or `optimize_paper`; options that do not apply to the mode; both of `nodes` and
-        `target_error`, or of `nodes` and `spacing`; labels or a mask beside a content; a number of nodes that exceeds
-        the image's detail (see `octree_mesh`) or the memory; or an error below the image's noise.
+        `target_error`, or of `nodes` and `spacing`; `nodes_max` without `target_error`, or below what sizes take;
+        labels or a mask beside a content; a number of nodes that exceeds the image's detail (see `octree_mesh`) or the
+        memory; or an error below the image's noise.
     TypeError
         An unknown option.
 
@@ -194,7 +206,7 @@ def mesh_image(
             raise InputError("mesh_image: give labels and mask to tetopt.content, or an image instead of a content")
         image = make_content(image, labels, mask)
     image = plain(image)
-    aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind)
+    aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind, nodes_max)
     search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
     for attempt in search:
         search.tell(attempt.run())
@@ -212,17 +224,19 @@ class Aim(NamedTuple):
     start: Mesh | None = None
     spacing: float | None = None
     kind: str | None = None
+    nodes_max: int | None = None
 
 
 class Attempt(NamedTuple):
-    """A run of a search."""
+    """A run of a search; `predicted` corners, by the runs before it, take the target error."""
 
     initial: Mesh
     run: Run
+    predicted: int | None = None
 
 
 Search = Generator[Attempt, None, MeshingResult]  # yields attempts, and returns the result that counts
-Attempted = Callable[[Mesh, int | None], Search]  # one attempt, with the number of nodes that exchanges lead to
+Attempted = Callable[..., Search]  # one attempt, with the number of nodes that exchanges lead to, and that predicted
 
 
 class MeshSearch:
@@ -247,6 +261,8 @@ class MeshSearch:
             is_graded = mode == "graded"
             nodes = default_nodes(content, aim.sizes, aim.order) if is_graded else DEFAULT_NODES[content.image.ndim]
             aim = aim._replace(nodes=nodes)
+        if aim.target_error is not None and aim.nodes_max is None:
+            aim = aim._replace(nodes_max=TARGET_NODES_MAX)
         self._options = _with_defaults(mode, options)
         if mode == "graded":
             aim = aim._replace(sizes=sizes_of_order(content, aim.nodes, aim.sizes, aim.order))
@@ -261,12 +277,12 @@ class MeshSearch:
         """Take the result of the attempt."""
         self._told = result
 
-    def _attempted(self, initial: Mesh, nodes: int | None) -> Search:
+    def _attempted(self, initial: Mesh, nodes: int | None, predicted: int | None = None) -> Search:
         """Yield the attempt with an initial mesh, and return its result."""
         initial, n_dropped, dropped = self._carved(initial)
         check_memory_of(self._content, max(nodes or 0, len(initial.points)))
         start_of_run = time.perf_counter()
-        yield Attempt(initial, partial(self._optimised, initial, nodes))
+        yield Attempt(initial, partial(self._optimised, initial, nodes), predicted)
         self._seconds += time.perf_counter() - start_of_run
         return _with_dropped(self._told, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
 
@@ -303,7 +319,7 @@ class MeshSearch:
 def _searched(content: Content, aim: Aim, attempted: Attempted) -> Search:
     """Search for the mesh of an aim."""
     if aim.target_error is not None:
-        return meshed_to_error(content, aim.target_error, aim.sizes, attempted)
+        return meshed_to_error(content, aim, attempted)
     if aim.start is not None:
         return attempted(aim.start, None)
     if aim.order == 2 and aim.nodes is not None:
@@ -384,13 +400,18 @@ def _check_names(options: dict[str, Any], optimisation: Run) -> None:
             raise TypeError(f"mesh_image() got an unexpected keyword argument {name!r}{hint}")
 
 
+def nodes_per_corner(ndim: int, order: int) -> float:
+    """Usual number of nodes of an order per corner of a graded mesh."""
+    return QUADRATIC_NODES[ndim] if order == 2 else 1.0
+
+
 def default_nodes(content: Content, sizes: Sizes | None, order: int) -> int:
     """Number of nodes, including mid-edge ones for order 2, that targets require, and elsewhere a part of the usual.
 
     The usual number is `DEFAULT_NODES`, or one per eight voxels of a small image.
     """
     n = content.image.ndim
-    many = QUADRATIC_NODES[n] if order == 2 else 1.0
+    many = nodes_per_corner(n, order)
     corners = float(np.clip(content.n_voxels // 8, 2 ** (n + 2), DEFAULT_NODES[n] / many))
     if sizes is not None and sizes.has_target:
         needed, fraction = nodes_of_sizes(content, sizes)
@@ -405,14 +426,14 @@ def with_label_sizes(
 
     `nodes` is the mesh's number, for order 2 including mid-edge nodes.
     """
-    many = QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0
+    many = nodes_per_corner(content.image.ndim, order)
     made = sizes_by_label(sizes, content, None if nodes is None else round(nodes / many))
     return (sizes, None) if made is None else (made.sizes, made._replace(nodes=round(many * made.nodes)))
 
 
 def _check_aim(content: Content, aim: Aim) -> None:
     """Raise InputError for an unknown mode, and for arguments that do not apply to it."""
-    mode, order = aim.mode, aim.order
+    mode, order, ndim = aim.mode, aim.order, content.image.ndim
     if mode not in MODE_DEFAULTS:
         raise InputError(f"mesh_image: expected mode {', '.join(MODE_DEFAULTS)}, got {mode!r}")
     if order not in (1, 2):
@@ -423,6 +444,12 @@ def _check_aim(content: Content, aim: Aim) -> None:
         raise InputError(f"mesh_image: mode {mode!r} takes {takes}, not {unknown[0]}")
     if mode == "graded" and "nodes" in names and "target_error" in names:
         raise InputError("mesh_image: give only one of nodes and target_error")
+    if aim.nodes_max is not None:
+        if aim.target_error is None:
+            raise InputError("mesh_image: nodes_max needs target_error; without it, give the number of nodes itself")
+        fewest = ceil(nodes_per_corner(ndim, order) * (2**ndim + 1))
+        if not (isinstance(aim.nodes_max, int | np.integer) and aim.nodes_max >= fewest):
+            raise InputError(f"nodes_max: expected a whole number, {fewest} or more in {ndim}-D, got {aim.nodes_max!r}")
     if mode in ("uniform", "paper") and "nodes" in names and "spacing" in names:
         raise InputError("mesh_image: give only one of nodes and spacing")
     if mode == "start" and not names:
@@ -486,8 +513,8 @@ def meshed_in_all(content: Content, aim: Aim, attempted: Attempted) -> Search:
     return nearest[0][1]
 
 
-def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None, attempted: Attempted) -> Search:
-    """Repeat runs with other numbers of nodes until the unexplained variance is just below a target.
+def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
+    """Repeat runs with up to `nodes_max` nodes until the unexplained variance is just below a target.
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
     if none does, of the run with the least error, or of one that was cut short. It is the same as with that number of
@@ -497,31 +524,27 @@ def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None, 
     Raises
     ------
     InputError
-        A fraction out of range, or below that of the image's noise, which no mesh should follow; as for `octree_mesh`.
+        As for `_check_reachable` and `octree_mesh`; or sizes take more than `nodes_max`.
     """
-    check_target_error(target_error)
-    variance = content.variance
-    if variance == 0.0:
-        raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
-    noise = content.noise * content.unit / variance
-    if target_error <= noise:
-        raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise fraction, estimated as {noise:.3g}, "
-            "so cells would have to follow the noise; use a larger fraction, or denoise the image"
-        )
+    target_error, nodes_max, sizes = aim.target_error or 0.0, aim.nodes_max or 0, aim.sizes
+    _check_reachable(content, target_error)
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
-    nodes, fractions = FIRST_NODES[content.image.ndim], dict[int, float]()  # unexplained variance by number of nodes
+    nodes, predicted, ratio = FIRST_NODES[content.image.ndim], None, nodes_per_corner(content.image.ndim, aim.order)
+    fractions = dict[int, float]()  # unexplained variance by number of nodes
     best: list[MeshingResult] = []  # the one so far: no more results are kept
     runs = EarlierRuns()
     for _ in range(ERROR_RUNS):
-        nodes = max(nodes, fewest)
-        initial = nearest_octree(content, nodes, sizes)
-        # Limits on sizes may require more nodes than the error, or allow fewer; a mask's octree is only roughly near.
-        if content.region is None and not is_near(len(initial.points), nodes):
-            nodes = len(initial.points)
-        if _is_repeated(runs, initial, nodes):
+        most = round(nodes_max / ratio)
+        if (nodes := max(min(nodes, most), fewest)) <= most:
+            initial = nearest_octree(content, nodes, sizes)
+            # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is only roughly near.
+            if content.region is None and not is_near(len(initial.points), nodes):
+                nodes = len(initial.points)
+        if nodes > most and not best:
+            raise _beyond(nodes_max, round(ratio * nodes))
+        if nodes > most or _is_repeated(runs, initial, nodes):
             break
-        result = yield from attempted(initial, nodes)
+        result = yield from attempted(initial, nodes, predicted)
         count, fraction = len(result.mesh.points), unexplained_by(content, result.mesh, result.history[-1])
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:
@@ -534,10 +557,29 @@ def meshed_to_error(content: Content, target_error: float, sizes: Sizes | None, 
             best = [result]
         if ERROR_REACHED * target_error <= fraction <= target_error:
             return result
-        nodes = _next_nodes(content.image, fractions, target_error)
-        if nodes in fractions:
+        nodes = predicted = max(_next_nodes(content.image, fractions, target_error), fewest)
+        if nodes in fractions or (count >= most and fraction > target_error):
             break
+        ratio = node_count(result.mesh.points, result.mesh.cells, aim.order) / count
     return best[0]
+
+
+def _check_reachable(content: Content, target_error: float) -> None:
+    """Raise InputError for a fraction out of range, or below that of the image's noise, which no mesh should follow."""
+    check_target_error(target_error)
+    variance = content.variance
+    if variance == 0.0:
+        raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
+    noise = content.noise * content.unit / variance
+    if target_error <= noise:
+        raise InputError(
+            f"target_error: {target_error:g} of the variance is below the noise fraction, estimated as {noise:.3g}, "
+            "so cells would have to follow the noise; use a larger fraction, or denoise the image"
+        )
+
+
+def _beyond(nodes_max: int, needed: int) -> InputError:
+    return InputError(f"nodes_max: sizes take {needed} nodes or more, got {nodes_max}; allow as many, or larger cells")
 
 
 def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:
@@ -549,13 +591,13 @@ def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -
 
 def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int:
     """The number of nodes to try next: between the nearest ones on either side, or beyond the nearest."""
-    aim = 0.5 * (1.0 + ERROR_REACHED) * target
     above = max((n for n, fraction in fractions.items() if fraction > target), default=None)
     below = min((n for n, fraction in fractions.items() if fraction <= target), default=None)
+    aim = ERROR_AIM * target
     least = 0.03 * aim  # the error may be 0
     if above is not None and below is not None and above < below:
         part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
         return int(above * (below / above) ** part)
     nearest = min(fractions) if above is None else above
-    ratio = max(fractions[nearest], least) / aim
-    return int(np.clip(nearest * ratio ** (1.0 / ERROR_RATE), 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))
+    wanted = nearest * nodes_ratio(max(fractions[nearest], least), target)
+    return int(np.clip(wanted, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))

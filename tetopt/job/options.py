@@ -20,6 +20,7 @@ from tetopt.engine.loop import (
     MIN_DIHEDRAL,
     SHAPE_POWER,
     START_K_D,
+    TARGET_NODES_MAX,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
@@ -230,6 +231,10 @@ class SizeOptions:
     target_error: Annotated[
         float | None,
         Option("T", "Instead of a number of nodes: the fraction of the image's variance left unexplained."),
+    ] = None
+    nodes_max: Annotated[
+        int | None,
+        Option("N", f"With `target_error`: the most nodes that it may take (default {TARGET_NODES_MAX}).", least=5),
     ] = None
     size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = None
     edge_size: Annotated[

@@ -11,13 +11,13 @@ import numpy as np
 
 from tetopt.contents.content import Content, check_weights
 from tetopt.engine.fast import check_options
-from tetopt.engine.loop import DEFAULT_NODES, MIN_DIHEDRAL, SHAPE_POWER
+from tetopt.engine.loop import DEFAULT_NODES, MIN_DIHEDRAL, SHAPE_POWER, TARGET_NODES_MAX
 from tetopt.engine.meshing import (
     MODE_DEFAULTS,
-    QUADRATIC_NODES,
     Mode,
     check_target_error,
     default_nodes,
+    nodes_per_corner,
     sizes_of_order,
     with_label_sizes,
 )
@@ -122,7 +122,7 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
     """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
     return {
-        "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
+        "nodes": job.nodes, "target_error": job.target_error, "nodes_max": job.nodes_max, "spacing": job.spacing,
         "lattice": kind_of(plan, ndim), "size_min": job.size_min, "edge_size": job.edge_size,
         "edge_max": job.edge_max, "gradation": job.gradation,
         "cells_across": job.cells_across, "label_size": job.label_size,
@@ -235,13 +235,15 @@ def _check_numbers(job: JobOptions) -> None:
         parse_crop(job.crop)
     if job.slice_ is not None:
         parse_slice(job.slice_)
-    most = round(MAX_NODES * (QUADRATIC_NODES[3] if job.order == 2 else 1))
+    most = round(MAX_NODES * nodes_per_corner(3, job.order or 1))
     if job.nodes is not None and not FEWEST_NODES <= job.nodes <= most:
         raise InputError(f"`nodes`: expected a whole number from {FEWEST_NODES} to {most}, got {job.nodes}")
     if job.spacing is not None and not 0.0 < job.spacing < np.inf:
         raise InputError(f"`spacing`: expected a length above 0 mm, got {job.spacing}")
     if job.target_error is not None:
         check_target_error(job.target_error)
+    elif job.nodes_max is not None:
+        raise InputError("`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes")
     _limits(changed(job, sizing=None, label_size=None))
     if job.label_size is not None:
         label_sizes_of(job.label_size)
@@ -289,7 +291,8 @@ def _completed(job: JobOptions, mode: Mode) -> JobOptions:
     if job.max_gb is not None and not job.max_gb > 0.0:
         raise InputError(f"`max_gb`: expected more than 0, got {job.max_gb}")
     boundary = job.boundary or default.boundary
-    job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary)
+    nodes_max = TARGET_NODES_MAX if job.nodes_max is None and job.target_error is not None else job.nodes_max
+    job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary, nodes_max=nodes_max)
     _check_method(job, "paper", ("n_t", "retessellate"))
     _check_method(job, "fast", ("shape_power", "min_dihedral"))
     if mode == "paper":
@@ -351,7 +354,7 @@ def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int |
     """Return the number of nodes that target sizes take, for order 2 with mid-edge nodes; None without targets."""
     if sizes is None or not sizes.has_target:
         return None
-    return round(nodes_of_sizes(content, sizes)[0] * (QUADRATIC_NODES[content.image.ndim] if plan.order == 2 else 1.0))
+    return round(nodes_of_sizes(content, sizes)[0] * nodes_per_corner(content.image.ndim, plan.order))
 
 
 def expected_nodes(plan: Plan, content: Content) -> int:
