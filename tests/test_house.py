@@ -20,7 +20,7 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT 
 WIDE = {
     "tetopt.fem.elasticity.compression": 9,
     "tetopt.engine.fast.optimize": 14,
-    "tetopt.engine.meshing.mesh_image": 14,
+    "tetopt.engine.meshing.mesh_image": 15,
     "tetopt.engine.paper.optimize_paper": 12,
     "tetopt.model.build.build_model": 15,
 }

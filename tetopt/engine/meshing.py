@@ -599,5 +599,5 @@ def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int
         part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
         return int(above * (below / above) ** part)
     nearest = min(fractions) if above is None else above
-    wanted = nearest * nodes_ratio(max(fractions[nearest], least), target)
-    return int(np.clip(wanted, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))
+    number = nearest * nodes_ratio(max(fractions[nearest], least), target)
+    return int(np.clip(number, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))
