@@ -1010,7 +1010,9 @@ def test_target_error_with_the_most_nodes(tmp_path, capfd):
     assert exit_code(*command, "--target-error", "0.001", "--nodes-max", "230") == 1
     numbers, err = numbers_in(tmp_path / "a.json"), " ".join(capfd.readouterr().err.split())
     (first, left), (last, reached) = re.findall(r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err)
-    pattern = r"an error of 0.001 takes about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
+    pattern = (
+        r"an error of 0.001 takes about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
+    )
     ((predicted, words),) = re.findall(pattern, err)
     assert (int(first), int(last), words) == (200, 230, "more than --nodes-max, so that the next run has 230 nodes")
     assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / 0.7), rel=0.01)

@@ -558,9 +558,9 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
         if ERROR_REACHED * target_error <= fraction <= target_error:
             return result
         nodes = predicted = max(_next_nodes(content.image, fractions, target_error), fewest)
-        if nodes in fractions or (count >= most and fraction > target_error):
+        ratio = (total := node_count(result.mesh.points, result.mesh.cells, aim.order)) / count
+        if nodes in fractions or (total > (1.0 - NODES_NEAR) * nodes_max and fraction > target_error):
             break
-        ratio = node_count(result.mesh.points, result.mesh.cells, aim.order) / count
     return best[0]
 
 
