@@ -40,6 +40,7 @@ from tetopt.engine.loop import (
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.requirements import (
     ERROR_AIM,
+    ERROR_RATE,
     ERROR_REACHED,
     checked_curved,
     nodes_ratio,
@@ -90,6 +91,7 @@ NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accep
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
 FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
 CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
+RATE_LIMITS = (0.3, 1.0)  # of a measured `ERROR_RATE`
 ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
 
@@ -599,5 +601,8 @@ def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int
         part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
         return int(above * (below / above) ** part)
     nearest = min(fractions) if above is None else above
-    number = nearest * nodes_ratio(max(fractions[nearest], least), target)
+    rate, other = ERROR_RATE, max((n for n in fractions if n < nearest), default=None)
+    if above is not None and other is not None:  # the rate of this image, by its last two runs
+        rate = float(np.clip(np.log(fractions[other] / fractions[nearest]) / np.log(nearest / other), *RATE_LIMITS))
+    number = nearest * nodes_ratio(max(fractions[nearest], least), target, rate)
     return int(np.clip(number, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))
