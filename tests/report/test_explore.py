@@ -2,19 +2,23 @@
 
 import base64
 import html
+import io
 import json
 import re
 
 import numpy as np
+import PIL.Image
 import pytest
 from browser import BLIND, FRAMES, copied, document
 from meshes import with_bent_edges
+from scipy import ndimage
+from scipy.spatial import Delaunay
 
 import tetopt
 from tetopt.contents.labels import LABEL_PALETTE
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
-from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.simplex import centroids, oriented, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.model.labels import LabelTable
 from tetopt.report import explore
@@ -632,3 +636,38 @@ def test_it_fits_a_narrow_window(shown):
 @pytest.mark.deep
 def test_without_webgl_it_is_said(shown):
     assert "This browser does not support WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]
+
+
+def ball(radius=30.0, n=600):
+    """A mesh of a convex ball, of random nodes on its surface and inside."""
+    random = np.random.default_rng(3)
+    places = random.normal(size=(2 * n, 3))
+    places /= np.linalg.norm(places, axis=1)[:, None]
+    places[n:] *= 0.93 * random.random((n, 1)) ** (1 / 3)
+    points = radius * places
+    cells = Delaunay(points).simplices.astype(np.int64)
+    return tetopt.Mesh(points, oriented(points, cells))
+
+
+@pytest.mark.deep
+def test_nothing_is_drawn_beside_a_cut_body(tmp_path):
+    """Facets of the removed part, seen edge-on beside the kept one, leave no dots."""
+    mesh = ball()
+    heights = np.linspace(-15.0, 15.0, 13)
+    probe = f"""<script>addEventListener("load", () => setTimeout(async () => {{
+  const said = [], at = document.getElementById("at-number");
+  for (const height of {heights.tolist()}) {{
+    at.value = height;
+    at.dispatchEvent(new Event("change"));
+    await new Promise((done) => setTimeout(done, 60));
+    said.push(document.querySelector("canvas").toDataURL());
+  }}
+  document.documentElement.dataset.said = said.join(" ");
+}}, 400));</script>"""
+    text = explorer_html(exhibit(mesh, {"label": np.ones(len(mesh.cells), dtype=np.int64)}))
+    shown = document(copied(text, tmp_path / "page.html", last=probe), "--window-size=1000,700")
+    said = re.search(r'data-said="([^"]*)"', shown)[1].split(" ")
+    pictures = [PIL.Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in said]
+    assert len(pictures) == len(heights)
+    bodies = [ndimage.label(np.asarray(picture).min(axis=2) < 250, np.ones((3, 3)))[1] for picture in pictures]
+    assert bodies == [1] * len(heights)

@@ -114,9 +114,10 @@ function renderer(gl, image, radius, depth, table, noValue) {
     for (const [name, kind] of Object.entries(KINDS)) {
       if (isPicking ? name === "slice" || name === "set" : name === "section" && fraction < 0) continue;
       if (name === "glass") continue;  // last
-      // The slice lies behind the cells cut by its plane, a highlighted set before the facets it is made of; these have
-      // the same corners, so a few steps of depth are enough, and steep ones do not come through others.
-      const [slope, nearer] = { slice: [1, 1], set: [0, -16] }[name] || [0, 0];
+      // Cut cells lie before facets that end at their plane within the same pixel, which would break their rim into
+      // dots; the slice lies behind them; a highlighted set before the facets it is made of: these have the same corners,
+      // so a few steps of depth are enough, and steep ones do not come through others.
+      const [slope, nearer] = { section: [-1, -1], slice: [1, 1], set: [0, -16] }[name] || [0, 0];
       if (nearer) gl.enable(gl.POLYGON_OFFSET_FILL);
       else gl.disable(gl.POLYGON_OFFSET_FILL);
       gl.polygonOffset(slope, nearer);

@@ -5,7 +5,8 @@ const VERTEX = `#version 300 es
   precision highp float; precision highp int;
   in vec3 place; in uint tag; in float value; in vec3 origin;
   uniform mat3 turn; uniform vec3 scale; uniform vec2 shift;
-  out vec3 world; out vec3 rest; out vec3 seen; out vec3 corner; out float level; flat out uint cell; flat out uint sides;
+  centroid out vec3 world; centroid out vec3 rest;
+  out vec3 seen; out vec3 corner; out float level; flat out uint cell; flat out uint sides;
   void main() {
     int k = gl_VertexID % 3;  // vertices are not shared, so this is the corner's number in its triangle
     corner = vec3(k == 0, k == 1, k == 2);
@@ -20,7 +21,9 @@ const VERTEX = `#version 300 es
 // The beginning of a view's fragment shader: the line along the drawn sides, 0 to 1, and the light on a facet.
 const SHADING = `#version 300 es
   precision highp float; precision highp int; precision highp sampler3D;
-  in vec3 world; in vec3 rest; in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
+  // Positions within the triangle: at a pixel's centre beside a steep facet, they would be those of the kept side.
+  centroid in vec3 world; centroid in vec3 rest;
+  in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
   out vec4 colour;
   float edge() {
     vec3 step = fwidth(corner);
