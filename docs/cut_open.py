@@ -17,9 +17,11 @@ import pyvista
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tetopt import Image, InputError, Mesh, cell_labels, cell_moments, load_image, load_mesh
+from tetopt import Image, InputError, LabelTable, Mesh, cell_labels, cell_moments, load_image, load_mesh
+from tetopt.job.inputs import label_table
+from tetopt.model.labels import NO_TABLE
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
-from tetopt.report.figures import save_figure
+from tetopt.report.figures import LETTER_INCHES, save_figure
 from tetopt.report.scene import Draw, View, cutaway, put_scene, view_of
 from tetopt.system.files import checked_output
 
@@ -30,13 +32,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("mesh", type=Path, help="mesh of tetrahedra")
     parser.add_argument("--image", type=Path, required=True, help="volume it was made of")
     parser.add_argument("--labels", type=Path, help="labels of its voxels; cells of label 0 are left out")
+    parser.add_argument("--label-names", type=Path, help="their names and colours; by default those in the mesh's file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="PNG")
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     options = parser.parse_args(argv)
     try:
         path = checked_output(options.output, (".png",), options.force)
-        labels = None if options.labels is None else load_image(options.labels)
-        save_cutaway(path, load_image(options.image), load_mesh(options.mesh).mesh, labels)
+        labels, loaded = None if options.labels is None else load_image(options.labels), load_mesh(options.mesh)
+        table = label_table(options.label_names, loaded, options.labels)
+        save_cutaway(path, load_image(options.image), loaded.mesh, labels, table)
     except InputError as error:
         print(f"cut_open: {error}", file=sys.stderr)
         return 2
@@ -44,7 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | None = None) -> None:
+def save_cutaway(
+    path: str | Path, image: Image, mesh: Mesh, labels: Image | None = None, table: LabelTable = NO_TABLE
+) -> None:
     """PNG of a mesh with its right, front, upper octant taken away: cells in the grey of their means, with edges.
 
     Parameters
@@ -56,6 +62,8 @@ def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | Non
     labels : Image, optional
         Whole numbers from 0. Cells of label 0, the background, are left out, and beside the greys the cells are shown
         in the colours of their labels, the same as in `tetopt.report.figures.label_figure`.
+    table : LabelTable
+        Names and colours of labels.
 
     Raises
     ------
@@ -74,11 +82,13 @@ def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | Non
     if labels is not None:
         view = view_of(part, of_cell[chosen].astype(np.float64), "label of each cell")
         numbers = np.arange(int(labels.data.max()) + 1)
-        colours = label_colours(numbers)
+        colours = label_colours(numbers, table.colours)
         pictures.append((view.title, photograph(labelled_cutaway(view, colours))))
-        handles = legend_patches(numbers, colours, np.bincount(view.values.astype(np.int64), minlength=len(numbers)))
+        shown = np.bincount(view.values.astype(np.int64), minlength=len(numbers))
+        handles = legend_patches(numbers, colours, shown, table.names)
     height, width = pictures[0][1].shape[:2]
-    figure = Figure(figsize=(5.6 * len(pictures) + bool(handles), 5.6 * height / width + 0.4), layout="constrained")
+    beside = LETTER_INCHES * max((10 + len(str(handle.get_label())) for handle in handles), default=0)
+    figure = Figure(figsize=(5.6 * len(pictures) + beside, 5.6 * height / width + 0.4), layout="constrained")
     for axes, (title, pixels) in zip(figure.subplots(1, len(pictures), squeeze=False)[0], pictures, strict=True):
         axes.imshow(pixels)
         axes.set_title(title, fontsize=11)

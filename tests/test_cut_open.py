@@ -71,6 +71,10 @@ def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
         assert grey_value == means[owner]
     assert [axes.get_title() for axes in figure.axes] == ["mean of the image in each cell", "label of each cell"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1", "2"]
+    table = tetopt.LabelTable({2: "right half"}, {2: (0.25, 0.5, 0.75)})
+    (_, coloured), figure = photographed(monkeypatch, tmp_path / "a.png", labels, mesh, labels, table)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1", "2 right half"]
+    assert np.unique(coloured.cell_data["colour"], axis=0).tolist() == [colours[1].tolist(), [64, 128, 191]]
 
 
 def test_a_cutaway_is_photographed_without_margins(tmp_path, opengl):
@@ -97,6 +101,21 @@ def test_nothing_but_background_is_refused(tmp_path):
     flat = tetopt.Image(np.zeros((6, 7)))
     with pytest.raises(tetopt.InputError, match="tetrahedra"):
         cut_open.save_cutaway(tmp_path / "a.png", flat, tetopt.lattice_mesh(flat, nodes=20))
+
+
+def test_names_are_those_in_the_mesh_s_file(monkeypatch, tmp_path):
+    """Or those of a table that is given."""
+    labels, tables = halves(), []
+    tetopt.save_image(tmp_path / "a.nii.gz", labels)
+    mesh = tetopt.lattice_mesh(labels, nodes=200)
+    model = tetopt.build_model(mesh, labels, about={"label_table": tetopt.LabelTable({1: "left half"}, {})})
+    tetopt.save_model(tmp_path / "a.vtu", model)
+    (tmp_path / "names.csv").write_text("label,name\n1,other half\n")
+    monkeypatch.setattr(cut_open, "save_cutaway", lambda *arguments: tables.append(arguments[-1].names))
+    image, mesh, picture, names = (str(tmp_path / name) for name in ("a.nii.gz", "a.vtu", "a.png", "names.csv"))
+    command = [mesh, "--image", image, "--labels", image, "-o", picture]
+    assert cut_open.main(command) == cut_open.main([*command, "--label-names", names]) == 0
+    assert tables == [{1: "left half"}, {1: "other half"}]
 
 
 def test_the_script(tmp_path, capsys, opengl):

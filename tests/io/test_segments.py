@@ -9,6 +9,7 @@ import tetopt
 from tetopt.errors import InputError
 from tetopt.io.images import load_image
 from tetopt.io.label_tables import load_label_table
+from tetopt.study.compare_files import _label_source
 
 sitk = pytest.importorskip("SimpleITK")
 
@@ -131,3 +132,12 @@ def test_real_overlapping_segments(data_dir):
     np.testing.assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
     assert 'segment "overlapping sphere" covers 491 of the 8487 voxels of "ribs", 118' in said[1]
     assert load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8] == "overlapping sphere"
+
+
+def test_a_comparison_names_labels_as_the_file_does(tmp_path):
+    """Its figures and report.json have these names, unless another table is given."""
+    path, names = seg_nrrd(tmp_path), tmp_path / "names.csv"
+    names.write_text("label,name\n1,hepar\n")
+    image, _ = read(path)
+    assert _label_source(path, image, None).names == {1: "liver", 2: "bone", 3: "tumour"}
+    assert _label_source(path, image, names).names == {1: "hepar"}

@@ -111,7 +111,7 @@ def _label_source(path: Path | None, labels: Image | None, names: Path | None) -
         raise InputError("`label_names`: needs `labels`")
     if path is None or labels is None:
         return None
-    there = table_of_labels(label_table(names), np.unique(labels.data).astype(np.int64).tolist())
+    there = table_of_labels(label_table(names, labels_path=path), np.unique(labels.data).astype(np.int64).tolist())
     return LabelSource(path.name, "given", sha256(path), there.names)
 
 
