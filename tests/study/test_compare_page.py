@@ -23,7 +23,7 @@ from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.study import compare_files
 from tetopt.study import compare_report as records
-from tetopt.study.compare_figures import histograms_figure, slices_figure, timing_figure
+from tetopt.study.compare_figures import histograms_figure, labels_figure, slices_figure, timing_figure
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import as_json
 from tetopt.study.compare_table import columns_of, number_text, rows_of
@@ -368,8 +368,8 @@ def whole(tmp_path_factory):
     means = [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes]
     report = fake_report()
     figures = {
-        "slices": slices_figure(image, meshes, means), "histograms": histograms_figure(report),
-        "timing": timing_figure(report),
+        "slices": slices_figure(image, meshes, means), "quadratic": slices_figure(image, meshes, means),
+        "labels": labels_figure(report), "histograms": histograms_figure(report), "timing": timing_figure(report),
     }  # fmt: skip
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png", dpi=80)
@@ -383,24 +383,41 @@ def test_nothing_points_outside(whole):
     assert not re.search(r"(src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z./]+", re.sub(r"base64,[^\"]*", "", page))
     assert "http:" not in page
     assert "https:" not in page
-    order = [page.index(f'alt="{name}"') for name in ("slices", "histograms", "timing")]
+    order = [page.index(f'alt="{name}"') for name in ("slices", "quadratic", "labels", "histograms", "timing")]
     assert order == sorted(order)
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("width", [1150, 500])  # Chromium has no narrower window
+@pytest.mark.parametrize("width", [1280, 500])  # Chromium has no narrower window
 def test_the_page_in_a_browser(whole, tmp_path, width):
-    """Pictures load, and the page itself never scrolls sideways."""
+    """Pictures load, a clicked one is enlarged, the page never scrolls sideways, and is short on a wide screen."""
     probe = (
         "<script>addEventListener('load', () => setTimeout(() => { const d = document.documentElement; "
         "d.dataset.images = [...document.images].map((i) => i.naturalWidth).join(); "
-        "d.dataset.over = d.scrollWidth - d.clientWidth; }, 300))</script>"
+        "d.dataset.over = d.scrollWidth - d.clientWidth; d.dataset.height = d.scrollHeight; "
+        "const last = document.images[4], widths = [last.clientWidth]; last.parentNode.focus(); "
+        "d.dataset.widths = [...widths, last.clientWidth].join(); }, 2000))</script>"
     )
     copy = copied(whole.read_text(encoding="utf-8"), tmp_path / "copy.html", last=probe)
-    data = dict(re.findall(r'data-(images|over)="([^"]*)"', document(copy, f"--window-size={width},900")[:400]))
-    assert len(data["images"].split(",")) == 3
-    assert all(int(size) > 100 for size in data["images"].split(","))
+    head = document(copy, f"--window-size={width},900")[:400]
+    data = dict(re.findall(r'data-(images|over|height|widths)="([^"]*)"', head))
+    assert len(data["images"].split(",")) == 5
+    assert min(map(int, data["images"].split(","))) > 100, data
     assert int(data["over"]) <= 0
+    before, after = map(int, data["widths"].split(","))
+    if width > 1000:
+        assert int(data["height"]) <= 5000
+        assert after > 1.2 * before
+    else:
+        assert after == before
+
+
+def test_nothing_is_folded(tmp_path):
+    """Whatever tetopt is behind in is in sight: a row for each mesh, the controls' as well, and no part that opens."""
+    report = fake_report()
+    page = page_of(tmp_path, report)
+    assert not re.search(r"<details|hidden", page)
+    assert {"BCC lattice", "BCC lattice, quadratic"} <= numbers_of(page, report).keys()
 
 
 @pytest.mark.deep
