@@ -3,8 +3,8 @@
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const [KEY, STATUS, REASON, FLAGS, FLAG_COUNT, MESH, FILES, FIRST] = [0, 1, 2, 3, 4, 5, 6, 7]; // of a row
-const PAGE_ROWS = 50; // drawn at once in the table: 50 pictures and some 20 columns draw in a tenth of a second
-const PAGE_TILES = 120; // drawn at once without the table; pictures take most of the time
+const PAGE_ROWS = 20; // drawn at once in the table, and without it: either is four screens high
+const PAGE_TILES = 48;
 const BINS = 24;
 const CHART = { width: 230, height: 74 };
 // Subjects to look at first; failed ones have their own table above.
