@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import PIL.Image
 import pytest
-from browser import browser
+from browser import browser, copied, document
 
 import tetopt
 from tetopt.cli import main
@@ -115,10 +115,14 @@ def test_segmentation_improves_on_the_lattice(run):
 
 @pytest.mark.full
 def test_page_in_a_browser(run, tmp_path):
-    """Headless Chromium draws the page and reports no script or image error."""
+    """Headless Chromium draws the page and reports no script or image error; it is short on a wide screen."""
     picture = f"--screenshot={tmp_path / 'page.png'}"
     browser(tmp_path / "profile", "--window-size=1000,3000", picture, (run / "paper.html").as_uri())
     assert np.std(np.asarray(PIL.Image.open(tmp_path / "page.png").convert("L"))) > 20.0
+    height = "<script>onload = ({target: {documentElement: e}}) => { e.dataset.height = e.scrollHeight; }</script>"
+    copy = copied((run / "paper.html").read_text(encoding="utf-8"), tmp_path / "copy.html", last=height)
+    head = document(copy, "--window-size=1280,900")[:400]
+    assert int(re.search(r'data-height="(\d+)"', head)[1]) <= 5000
 
 
 @pytest.mark.full

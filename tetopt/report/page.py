@@ -66,7 +66,8 @@ def picture_html(path: str | Path, caption: str) -> Markup:
     data = base64.b64encode(png).decode("ascii")
     shape = "wide broad" if width > BROAD_RATIO * height else "wide"
     return Markup(
-        '<figure><div class="{}" tabindex="0"><img alt="{}" width="{}" height="{}" src="data:image/png;base64,{}"></div>'
+        '<figure><div class="{}" tabindex="0">'
+        '<img alt="{}" width="{}" height="{}" src="data:image/png;base64,{}"></div>'
         "<figcaption>{}</figcaption></figure>"
     ).format(shape, caption, width, height, data, caption)
 
