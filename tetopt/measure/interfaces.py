@@ -21,7 +21,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.labels import checked_labels
-from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
+from tetopt.geometry.manifold import LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.topology import Facets, facets, linked
 from tetopt.image import Image, transformed
@@ -153,7 +153,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
         "nonmanifold_nodes": counts(fans.label[nodes]),
         "nonmanifold_nodes_two_labels": counts(fans.label[nodes & (fans.n_labels == 2)]),
         "mesh_euler": _cell_eulers(shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)),
-        "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels, _outer_spaces(mesh.points, surfaces)),
+        "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels),
     }
     pieces, n_pieces = mesh.straight_pieces()
     if n_pieces > 1:  # topology is that of the cells
@@ -316,69 +316,23 @@ def _cell_eulers(
 
 
 def _cell_cavities(
-    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int, space: NDArray[np.int64]
+    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int
 ) -> NDArray[np.int64]:
-    """`voxel_cavities` of each label's cells: nodes connect the space around them; see `_outer_spaces`."""
-    cavities = np.zeros(n_labels, dtype=np.int64)
+    """`voxel_cavities` of each label's cells, where nodes connect the space around them.
+
+    Cells connected by facets have one closed surface for each part of the space around them (Alexander's duality): all
+    but one of these enclose a cavity. Facets of one such surface are linked by nodes.
+    """
     if cells.shape[1] == 3:
-        return cavities
-    near, far = shared.cells[(shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] == of_cell[shared.cells[:, 1]])].T
-    n_pieces, piece = linked(near, far, len(cells))
-    n_in_all, boundary = n_pieces + int(space.max()) + 1, np.flatnonzero(space >= 0)
-    of_piece = np.full(n_in_all, OUTSIDE_LABEL)
-    of_piece[piece] = of_cell
-    outer = boundary * n_in_all + n_pieces + space[boundary]
-    meets = np.unique(np.concatenate([(cells * n_in_all + piece[:, None]).ravel(), outer]))
-    node, piece = np.divmod(meets, n_in_all)
-    pairs = [np.empty((0, 2), dtype=np.int64)]
-    for step in range(1, int(np.bincount(node).max())):  # link all components at a node
-        is_same = node[step:] == node[:-step]
-        pairs.append(np.column_stack([piece[:-step], piece[step:]])[is_same])
-    one, other = np.unique(np.vstack(pairs), axis=0).T
-    for label in np.unique(of_cell):
-        is_around = of_piece != label
-        is_link = is_around[one] & is_around[other]
-        _, part = linked(one[is_link], other[is_link], n_in_all)
-        cavities[label] = len(np.unique(part[is_around])) - 1
-    return cavities
-
-
-def _outer_spaces(points: NDArray[np.float64], surfaces: LabelSurfaces) -> NDArray[np.int64]:
-    """The connected part of the space outside the mesh that each boundary node lies at, (N,); -1 inside, 0 in 2-D.
-
-    0 is the unbounded part; the others are voids, each with a boundary component that faces inwards. The remaining
-    components, of islands, lie in the smallest void that contains them, or else in the unbounded part.
-    """
-    space = np.full(len(points), -1, dtype=np.int64)
-    outer = surfaces.nodes[(surfaces.beyond == OUTSIDE_LABEL) & (surfaces.label != OUTSIDE_LABEL)]
-    if points.shape[1] == 2:
-        space[outer] = 0
-        return space
-    _, number = linked(outer[:, [0, 0]].ravel(), outer[:, 1:].ravel(), len(points))
-    names, of_facet = np.unique(number[outer[:, 0]], return_inverse=True)
-    corners = points[outer] - points.mean(axis=0)
-    volume = np.bincount(of_facet, np.linalg.det(corners))
-    voids = np.flatnonzero(volume < 0.0)[np.argsort(-volume[volume < 0.0], kind="stable")]  # the smallest first
-    of_part = np.zeros(len(names), dtype=np.int64)
-    of_part[voids] = np.arange(1, len(voids) + 1)
-    walls = [corners[of_facet == part] for part in voids]
-    for part in np.flatnonzero(volume > 0.0):
-        place = corners[np.argmax(of_facet == part), 0]
-        holders = (k for k, wall in enumerate(walls, 1) if _encloses(wall, place))
-        of_part[part] = next(holders, 0)
-    space[outer] = of_part[of_facet][:, None]
-    return space
-
-
-def _encloses(wall: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
-    """True if a closed surface, corners (F, 3, 3), contains a place: its solid angles sum to a full turn.
-
-    A triangle's solid angle is that of van Oosterom and Strackee (IEEE Trans. Biomed. Eng. 30, 1983).
-    """
-    if (place < wall.min(axis=(0, 1))).any() or (place > wall.max(axis=(0, 1))).any():
-        return False
-    a, b, c = np.moveaxis(wall - place, 1, 0)
-    p, q, r = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
-    over = p * q * r + (a * b).sum(axis=1) * r + (b * c).sum(axis=1) * p + (c * a).sum(axis=1) * q
-    angles = 2.0 * np.arctan2((a * np.cross(b, c)).sum(axis=1), over)
-    return abs(float(angles.sum())) > 2.0 * np.pi
+        return np.zeros(n_labels, dtype=np.int64)
+    near, far = shared.cells.T
+    is_inner = (shared.n_cells == 2) & (of_cell[near] == of_cell[far])
+    n_pieces, piece = linked(near[is_inner], far[is_inner], len(cells))
+    row, side = np.nonzero((shared.cells >= 0) & ~is_inner[:, None])
+    cell = shared.cells[row, side]
+    corners = piece[cell][:, None] + n_pieces * shared.nodes[row]
+    corner = np.unique(corners, return_inverse=True)[1].reshape(corners.shape)
+    n_surfaces, surface = linked(corner[:, [0, 0]].ravel(), corner[:, 1:].ravel(), int(corner.max()) + 1)
+    of_piece, of_surface = np.empty(n_pieces, dtype=np.int64), np.empty(n_surfaces, dtype=np.int64)
+    of_piece[piece], of_surface[surface[corner[:, 0]]] = of_cell, of_cell[cell]
+    return np.bincount(of_surface, minlength=n_labels) - np.bincount(of_piece, minlength=n_labels)
