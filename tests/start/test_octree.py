@@ -12,7 +12,7 @@ import tetopt
 from tetopt.contents.noise import noise_level
 from tetopt.start import octree
 from tetopt.start.clip import lost_fraction
-from tetopt.start.octree import _dilated, octree_mesh
+from tetopt.start.octree import octree_mesh
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -206,16 +206,6 @@ def test_a_bound_beyond_all_boxes_bounds_nothing():
     image = tetopt.Image(np.random.default_rng(1).normal(size=(6, 6, 6)))
     meshes = [tetopt.mesh_image(image, 50, iterations=0, sizes=tetopt.Sizes(longest=mm)).mesh for mm in (1e3, 1e300)]
     np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
-
-
-@pytest.mark.parametrize("n_rings", [0, 1, 2])
-@pytest.mark.parametrize("shape", [(7, 1), (5, 6, 7)])
-def test_rings_of_blocks(shape, n_rings):
-    """As of a filter of scipy's."""
-    chosen = np.random.default_rng(n_rings).random(shape) < 0.05
-    before = chosen.copy()
-    np.testing.assert_array_equal(_dilated(chosen, n_rings), ndimage.maximum_filter(chosen, size=2 * n_rings + 1))
-    np.testing.assert_array_equal(chosen, before)
 
 
 def shell(size, radius):
