@@ -36,7 +36,7 @@ def test_the_graded_mesh_is_that_of_mesh_image():
 
 
 def test_the_other_pipelines_do_not_see_labels():
-    for name in ("tetopt-paper", "odt", "bcc"):
+    for name in ("tetopt-paper", "bcc"):
         with_labels, without = (
             PIPELINES[name].function(PipelineInput(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
         )

@@ -105,17 +105,6 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
     return Produced(mesh, seconds, [f"ended by: {result.ended}", *notes], result.labels)
 
 
-def image_blind(job: PipelineInput) -> Produced:
-    """Run the paper's scheme with k_D = 0: optimal Delaunay triangulation, independent of the image.
-
-    Raises
-    ------
-    InputError
-        As `ours`.
-    """
-    return ours(job._replace(k_D=0.0), "paper")
-
-
 def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
     """Return the content of the mesh, and notes on it: the image, with labels if given."""
     if job.labels is None:
@@ -206,8 +195,4 @@ PIPELINES = {
         mmg, packages=("mmgpy",), hint=f"install it with: {install_hint('compare', 'mmgpy')}",
     ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
-    "odt": Pipeline(
-        "ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0",
-        image_blind,
-    ),
 }  # fmt: skip
