@@ -118,14 +118,13 @@ def comparison(folder: Path) -> dict[str, Any]:
                 raise SystemExit(f"measure: {result['name']}: {result['failure']}")
             run = result["median"]
             times = {"seconds": run["seconds_total"], "peak_gb": run["peak_bytes"] / 1e9}
-            meshes.setdefault(result["name"], {})[order] = mesh_summary(run) | times
+            meshes.setdefault(result["name"], {})[order] = mesh_summary(run, report["options"]["average"]) | times
     return {"reference": report["reference"], "meshes": meshes}
 
 
-def mesh_summary(measured: dict[str, Any]) -> dict[str, Any]:
+def mesh_summary(measured: dict[str, Any], average: str) -> dict[str, Any]:
     """Numbers that pages quote of one mesh of a comparison; errors by nu and average."""
     quality = measured["quality"]
-    solved = {nu: solution["averages"] for nu, solution in measured["fem"].items()}
     return {
         "nodes": measured["n_nodes"],
         "cells": measured["n_cells"],
@@ -134,7 +133,7 @@ def mesh_summary(measured: dict[str, Any]) -> dict[str, Any]:
         "bad": sum(quality["kinds"].values()) / quality["n_cells"],
         "cond": {nu: solution["cond"] for nu, solution in measured["fem"].items()},
         "cg_iterations": {nu: solution["cg_iterations"] for nu, solution in measured["fem"].items()},
-        "errors": {nu: {name: one["errors"] for name, one in by_name.items()} for nu, by_name in solved.items()},
+        "errors": {nu: {average: solution["errors"]} for nu, solution in measured["fem"].items()},
         "labels": {str(row["label"]): {"dice": row["dice"]} for row in measured["labels"]},
     }
 

@@ -188,7 +188,8 @@ def _ends_children():
     job = PipelineInput(tetopt.Image(np.zeros((4, 4)), np.eye(3)), None, 10)
     outcome = run_in_child(importlib.import_module("windows").asleep, job, max_seconds=10.0)
     pid = int(Path("started.txt").read_text(encoding="utf-8"))
-    return int(outcome.reason != "limit" or (psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie"))
+    is_ended = outcome.failure is not None and outcome.failure.startswith("out of time")
+    return int(not is_ended or (psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie"))
 
 
 def asleep(_job):

@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
-    settings = Settings(nodes=0, reference_dofs=options.dofs)
+    settings = Settings(nodes=0, reference_dofs=options.dofs, average="mean")
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
@@ -84,7 +84,7 @@ def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tet
 
 def error_of(simulation: Simulation, name: str) -> float:
     """One of a simulation's errors, moduli by Eq. (2)'s mean."""
-    return float(getattr(simulation.averages["mean"].errors, name))
+    return float(getattr(simulation.errors, name))
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import tetopt
-from tetopt.study.endings import Crashed, NotInstalled
+from tetopt.study.endings import Crashed
 from tetopt.study.pipelines import Produced
 from tetopt.system.child import signal_words
 
@@ -46,7 +46,7 @@ def wrap(job):
 
 
 def absent(job):
-    raise NotInstalled("thing: not installed")
+    raise tetopt.InputError("thing: not installed")
 
 
 def quit_early(job):

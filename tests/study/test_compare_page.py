@@ -18,7 +18,6 @@ from tetopt.cli.compare import compare_command
 from tetopt.fem.reference import Errors, OwnError
 from tetopt.io.text import plain
 from tetopt.measure.fidelity import LabelFidelity
-from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.study import compare_files
@@ -56,8 +55,8 @@ def fake_run(seed, scale, order=1, has_labels=False):
         n_empty_cells=0, quality=quality,
         rho_histogram=records.Histogram(np.linspace(0, 1 / 3, 21).tolist(), rho.tolist()),
         dihedral_histogram=records.Histogram(list(range(0, 181, 5)), angles.tolist()),
-        labels=[label_of(random, k) for k in range(4)], interfaces=[LabelInterface(*range(14))],
-        own_labels=[label_of(random, k) for k in range(4)] if has_labels else [], own_interfaces=[], fem=fem,
+        labels=[label_of(random, k) for k in range(4)],
+        own_labels=[label_of(random, k) for k in range(4)] if has_labels else [], fem=fem,
     )  # fmt: skip
     return records.PipelineRun({"kernels": 3.0, **seconds}, sum(seconds.values()), int(9e8 * scale), measurement)
 
@@ -74,14 +73,8 @@ def label_of(random, k):
 
 
 def simulation_of(random, scale):
-    """The default average errs a fifth less than Eq. (2)'s."""
-    averages = {
-        name: records.Solved(random.uniform(1.0, 2.0), errors_of(factor * scale), 0.5 / scale)
-        for name, factor in (("mean", 1.0), ("gauss", 0.8))
-    }
-    return records.Simulation(
-        random.uniform(1e2, 1e3), random.uniform(1e3, 1e5), int(random.integers(80, 300)), averages
-    )
+    eigenvalues = random.uniform(1e2, 1e3), random.uniform(1e3, 1e5), int(random.integers(80, 300))
+    return records.Simulation(*eigenvalues, random.uniform(1.0, 2.0), errors_of(scale), 0.5 / scale)
 
 
 def errors_of(scale):
@@ -108,21 +101,20 @@ def finished(report):
 def fake_report():
     """Five pipelines: the first has labels of its own, the second three runs, the third failed."""
     results = {1: [], 2: []}
-    for number, name in enumerate(("tetopt", "pytetwild", "mine", "bcc", "odt")):
+    for number, name in enumerate(("tetopt", "pytetwild", "mine", "bcc", "tetopt-paper")):
         title, kind = (PIPELINES[name].title, PIPELINES[name].kind) if name in PIPELINES else (name, "peer")
         n_runs = (1, 3, 0, 1, 1)[number]
         for order, pipelines in results.items():
             runs = [fake_run(10 * number + k, 1.0 + 0.3 * number, order, number == 0) for k in range(n_runs)]
             failure = None if runs else "twice crashed: signal 11, SIGSEGV; try another number of classes"
             about, notes = f"{title}, its options", [f"a note on {title}"]
-            reason, crashes = (None, []) if runs else ("crash", ["crashed: signal 11, SIGSEGV"] * 2)
-            result = records.PipelineResult(name, title, kind, about, failure, reason, crashes, notes, runs, None)
+            result = records.PipelineResult(name, title, kind, about, failure, notes, runs, None)
             pipelines.append(with_runs(result, runs))
     source = records.ImageSource("T1.nii.gz", "ab" * 32, None, None)
     return records.Report(
         command="tetopt compare T1.nii.gz -o out --nodes 5000",
         image=records.ImageFacts(source, (197, 233, 189), [1, 1, 1], 2841.2),
-        labels=records.LabelSource("labels.nii.gz", "given", "cd" * 32), mapping="1 kPa at 0, 10 kPa at 255",
+        labels=records.LabelSource("labels.nii.gz", "cd" * 32), mapping="1 kPa at 0, 10 kPa at 255",
         versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine={"cores": 2, "system": "Linux"},
         options=records.Settings(5000),
         reference=records.ReferenceGrid(
@@ -212,7 +204,7 @@ VALUES = {
     },
     **{
         (f"Error of the compression, ν = {nu}", title): lambda run, nu=nu, name=name: (
-            run["fem"][nu]["averages"]["gauss"]["errors"][name]
+            run["fem"][nu]["errors"][name]
         )
         for nu in ("0.3", "0.45")
         for title, name in (

@@ -10,8 +10,7 @@ from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box
 from tetopt.geometry.simplex import volumes
 from tetopt.study import mmg
-from tetopt.study.endings import NotInstalled
-from tetopt.study.mmg import classes_of, remeshed
+from tetopt.study.mmg import remeshed
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 needs_mmgpy = pytest.mark.skipif(PIPELINES["mmg"].missing is not None, reason="mmgpy is not installed")
@@ -45,16 +44,10 @@ def test_a_box_of_labelled_cells(labels, monkeypatch):
     assert first.points.tobytes() == again.points.tobytes()
 
 
-def test_classes_without_labels():
-    classes = classes_of(IMAGE, 3)
-    assert np.unique(classes.data).tolist() == [0, 1, 2]
-    assert all(np.ptp(IMAGE.data[classes.data == each]) < np.ptp(IMAGE.data) for each in range(3))
-
-
 @needs_mmgpy
 def test_what_is_refused(monkeypatch):
     with pytest.raises(tetopt.InputError, match="nodes: a box needs 8 or more, got 7"):
         remeshed(IMAGE, LABELS, 7)
     monkeypatch.setitem(sys.modules, "mmgpy", None)
-    with pytest.raises(NotInstalled, match=r"mmgpy: not installed; .* pip install"):
+    with pytest.raises(tetopt.InputError, match=r"mmgpy: not installed; .* pip install"):
         remeshed(IMAGE, LABELS, 100)

@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,13 @@ from tetopt.errors import InputError
 from tetopt.io.text import last_line
 from tetopt.job.events import note
 from tetopt.mesh import Mesh
-from tetopt.study.endings import AFTER_CRASHES, Crashed, NotInstalled
+from tetopt.study.endings import AFTER_CRASHES, Crashed
 from tetopt.study.pipelines import PipelineInput, Produced
 from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
 from tetopt.system.interpreter import python_command, python_environment
 
 SMOOTHING_FACTOR = 2.0  # `smoothing` of the run that follows a crash
-Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": not installed
 
 
 class Outcome(NamedTuple):
@@ -42,8 +41,7 @@ class Outcome(NamedTuple):
     peak_bytes: int  # largest resident memory of the child, interpreter and libraries included
     notes: list[str]
     failure: str | None  # one line; None without a failure
-    reason: Reason | None = None  # of the failure
-    crashes: tuple[str, ...] = ()  # of this run and of the one it repeats
+    is_crash: bool = False  # a failure that another run may not have
     labels: NDArray[np.int64] | None = None  # of each cell, if the pipeline sets labels
 
 
@@ -87,17 +85,17 @@ def run_in_child(
     if not max_seconds > 0.0 or (max_bytes is not None and max_bytes <= 0):
         raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
     first = _run_once(pipeline, job, max_seconds, max_bytes)
-    if first.reason != "crash":
+    if not first.is_crash:
         return first
     crash = first.failure or ""
     note(f"{title}: {crash}; running it again, with smoother surfaces")
     again = _run_once(pipeline, job._replace(smoothing=SMOOTHING_FACTOR), max_seconds, max_bytes)
-    again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes), crashes=(*first.crashes, *again.crashes))
+    again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes))
     if again.failure is None:
         words = f"the first run {crash}; this is the second, with surfaces {SMOOTHING_FACTOR:g} times as smooth"
         return again._replace(notes=[words, *again.notes])
     failure = f"twice {crash}" if again.failure == crash else f"{crash}; then {again.failure}"
-    return again._replace(failure=f"{failure}; {AFTER_CRASHES}" if again.reason == "crash" else failure)
+    return again._replace(failure=f"{failure}; {AFTER_CRASHES}" if again.is_crash else failure)
 
 
 def _run_once(
@@ -125,19 +123,16 @@ def _run_once(
 def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
     result, own_failure = folder / "result.pickle", folder / "failure.json"
     if limit is not None:
-        return Outcome(None, {}, peak, [], limit, "limit")
+        return Outcome(None, {}, peak, [], limit)
     if code == 0 and result.is_file():
         (mesh, seconds, notes, labels), own_peak = pickle.loads(result.read_bytes())
         return Outcome(mesh, seconds, max(peak, own_peak), notes, None, labels=labels)
-    reason: Reason = "error"
     if (words := signal_words(code)) is not None:
-        reason, failure = "crash", f"crashed: {words}"
-    else:
-        text = (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace")
-        if own_failure.is_file():
-            reason, text = json.loads(own_failure.read_text(encoding="ascii"))
-        failure = last_line(text) or f"ended with exit code {code} and no message"
-    return Outcome(None, {}, peak, [], failure, reason, crashes=(failure,) if reason == "crash" else ())
+        return Outcome(None, {}, peak, [], f"crashed: {words}", is_crash=True)
+    is_crash, text = False, (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace")
+    if own_failure.is_file():
+        is_crash, text = json.loads(own_failure.read_text(encoding="ascii"))
+    return Outcome(None, {}, peak, [], last_line(text) or f"ended with exit code {code} and no message", is_crash)
 
 
 def main(folder: Path) -> None:
@@ -147,10 +142,9 @@ def main(folder: Path) -> None:
         produced = pipeline(job)
         (folder / "result.pickle").write_bytes(pickle.dumps((produced, family_peak_bytes())))
     except Exception as error:
-        is_refusal = isinstance(error, InputError)
-        reason = "crash" if isinstance(error, Crashed) else "missing" if isinstance(error, NotInstalled) else "error"
         words = " ".join(str(error).split())
-        failure = [reason, words if is_refusal else f"{type(error).__name__}: {words}"]
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        failure = [isinstance(error, Crashed), kind + words]
         (folder / "failure.json").write_text(json.dumps(failure), encoding="ascii")
 
 

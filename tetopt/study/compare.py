@@ -27,7 +27,6 @@ from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.job.events import note, warning
 from tetopt.measure.fidelity import cell_labels, label_fidelity, unexplained_of
-from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
@@ -35,7 +34,7 @@ from tetopt.model.mappings import ModulusMapping
 from tetopt.report.summary import versions
 from tetopt.study import compare_report as records
 from tetopt.study.child import Outcome, run_in_child
-from tetopt.study.compare_report import Measurement, Report, Settings, averages_of
+from tetopt.study.compare_report import Measurement, Report, Settings
 from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import pipelines_with
 from tetopt.system.budget import available_bytes, memory_words
@@ -74,7 +73,7 @@ class Standard(NamedTuple):
     modulus_fine: Image  # the same field on about as many voxels as the image
     coarse_labels: NDArray  # of the reference's voxels
     references: dict[str, Reference]  # by nu
-    averages: tuple[str, ...]  # of a cell's moduli
+    average: str  # of a cell's moduli
     dofs: int  # at most, of the reference
 
 
@@ -109,7 +108,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         refined(modulus, fine.shape),
         nearest(labels, modulus).data,
         references,
-        averages_of(settings),
+        settings.average,
         dofs,
     )
 
@@ -158,31 +157,28 @@ def measured(
         rho_histogram=records.Histogram(edges.tolist(), fraction.tolist()),
         dihedral_histogram=records.Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=label_fidelity(labels, mesh, majority),
-        interfaces=label_interfaces(labels, mesh, majority),
         own_labels=[] if own is None else label_fidelity(labels, mesh, own),
-        own_interfaces=[] if own is None else label_interfaces(labels, mesh, own),
         fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
         not_compressed=not_compressed,
     )
 
 
 def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> records.Simulation:
-    """Run the compression test on a mesh, and measure its errors against the reference, for each average of moduli."""
+    """Run the compression test on a mesh, and measure its errors against the reference."""
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
-    averages: dict[str, records.Solved] = {}
-    for average in standard.averages:
-        young = element_young(standard.modulus_fine, mesh, None, average, order)
-        begin = time.thread_time()
-        # By multigrid for any size, so that all times are of one solver.
-        pressed = compression(
-            mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order, method="amg"
-        )
-        seconds = time.thread_time() - begin
-        errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
-        averages[average] = records.Solved(pressed.strain_energy, errors, seconds)
-    system = conditioning(pressed.system)  # for the last, the average that is set
-    return records.Simulation(system.lambda_max, system.cond, system.cg_iterations, averages)
+    young = element_young(standard.modulus_fine, mesh, None, standard.average, order)
+    begin = time.thread_time()
+    # By multigrid for any size, so that all times are of one solver.
+    pressed = compression(
+        mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order, method="amg"
+    )
+    seconds = time.thread_time() - begin
+    errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
+    system = conditioning(pressed.system)
+    return records.Simulation(
+        system.lambda_max, system.cond, system.cg_iterations, pressed.strain_energy, errors, seconds
+    )
 
 
 # All pipelines.
@@ -257,8 +253,6 @@ def _result(
         pipeline.kind,
         pipeline.about,
         outcomes[-1].failure,
-        outcomes[-1].reason,
-        crashes=[crash for each in outcomes for crash in each.crashes],
         notes=list(dict.fromkeys(note for each in outcomes for note in each.notes)),
         runs=[run for run, _ in done],
         median=median[0],
@@ -280,7 +274,7 @@ def _attempt(
         try:
             measurement = measured(standard, made.mesh, settings.percent, order, made.labels)
         except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
-            made = made._replace(mesh=None, failure=f"its mesh cannot be measured: {error}", reason="error")
+            made = made._replace(mesh=None, failure=f"its mesh cannot be measured: {error}")
     if made.mesh is None:
         made = made._replace(failure=(made.failure or "").removeprefix(f"{pipeline.title}: "))
         note(f"{title}: {made.failure}")

@@ -112,7 +112,7 @@ def _label_source(path: Path | None, labels: Image | None, names: Path | None) -
     if path is None or labels is None:
         return None
     there = table_of_labels(label_table(names, labels_path=path), np.unique(labels.data).astype(np.int64).tolist())
-    return LabelSource(path.name, "given", sha256(path), there.names)
+    return LabelSource(path.name, sha256(path), there.names)
 
 
 def _draw(paths: dict[str, Path], report: Report, image: Image, made: dict[int, dict[str, MadeMesh]]) -> list[str]:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors, OwnError
 from tetopt.measure.fidelity import LabelFidelity
-from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.interfaces import OTSU_CLASSES
@@ -31,7 +30,7 @@ class Settings(NamedTuple):
     iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
-    average: str = DEFAULT_AVERAGE  # of a cell's moduli, in addition to Eq. (2)'s mean
+    average: str = DEFAULT_AVERAGE  # of a cell's moduli
     reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
     max_seconds: float = 3600.0  # of one run of a pipeline
     max_bytes: int | None = None  # of one run, resident
@@ -50,7 +49,6 @@ class LabelSource(NamedTuple):
     """The file of the labels."""
 
     name: str
-    kind: str  # "given"
     sha256: str
     names: dict[int, str] = {}  # noqa: RUF012 - never modified; of the labels in the image that have one
 
@@ -66,21 +64,15 @@ class Histogram(NamedTuple):
     fraction: list[float]
 
 
-class Solved(NamedTuple):
-    """The compression of a mesh with one average of the moduli, and its errors against the reference."""
+class Simulation(NamedTuple):
+    """The compression test on a mesh for one Poisson's ratio, and its errors against the reference."""
 
+    lambda_max: float
+    cond: float
+    cg_iterations: int
     strain_energy: float  # uJ
     errors: Errors
     seconds: float  # of the processor, for assembly and solve, without moduli and errors
-
-
-class Simulation(NamedTuple):
-    """The compression test on a mesh, for one Poisson's ratio."""
-
-    lambda_max: float  # with `Settings.average`, as the next two
-    cond: float
-    cg_iterations: int
-    averages: dict[str, Solved]  # by the average of the moduli of a cell
 
 
 class Measurement(NamedTuple):
@@ -98,9 +90,7 @@ class Measurement(NamedTuple):
     rho_histogram: Histogram
     dihedral_histogram: Histogram  # degrees
     labels: list[LabelFidelity]  # each cell has the label of most of its voxels
-    interfaces: list[LabelInterface]
     own_labels: list[LabelFidelity]  # the same with the mesh's own labels of cells; empty without
-    own_interfaces: list[LabelInterface]
     fem: dict[str, Simulation]  # by nu; empty if the mesh cannot be compressed
     not_compressed: str | None = None  # why
 
@@ -122,8 +112,6 @@ class PipelineResult(NamedTuple):
     kind: str
     about: str
     failure: str | None  # the first, if a run failed
-    reason: str | None  # of it, as `tetopt.study.child.Reason`
-    crashes: list[str]  # of all runs; each run was repeated once
     notes: list[str]
     runs: list[PipelineRun]
     median: PipelineRun | None  # the run of the median E_D, the lower of two; None if no run gave a mesh
@@ -170,11 +158,6 @@ class Report(NamedTuple):
     pipelines: list[PipelineResult]  # meshes of the requested number of nodes, with linear cells
     quadratic: list[PipelineResult]  # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
     seconds: float
-
-
-def averages_of(settings: Settings) -> tuple[str, ...]:
-    """Return the averages of moduli for every mesh: Eq. (2)'s, and the selected one."""
-    return tuple(dict.fromkeys(("mean", settings.average)))
 
 
 def as_json(value: Any) -> Any:

@@ -64,7 +64,7 @@ def columns_of(report: Report) -> list[Column]:
             Column(
                 f"Error of the compression, ν = {nu}",
                 title,
-                _error(report, nu, name),
+                _error(nu, name),
                 -1,
                 is_short=(k, name) == (0, "displacement"),
             )
@@ -126,10 +126,10 @@ def judged_labels(report: Report) -> set[int]:
     return {label for label, n in voxels.items() if n > JUDGED_VOXELS} or set(voxels)
 
 
-def _error(report: Report, nu: str, name: str) -> Value:
+def _error(nu: str, name: str) -> Value:
     def value(run: PipelineRun) -> float | None:
         solved = run.measurement.fem.get(nu)
-        return None if solved is None else getattr(solved.averages[report.options.average].errors, name)
+        return None if solved is None else getattr(solved.errors, name)
 
     return value
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.geometry.quadratic import node_count
@@ -27,11 +26,6 @@ HAUSDORFF_FRACTION = 0.2  # distance of the interfaces from the lattice's, over 
 MMG_RUNS = 6  # of one search, at most
 FIRST_FACTOR = 2.0  # interfaces take more nodes
 MMG_RESPONSE = Response(-2.5, -4.0, -1.0, step=1.5, after_failure=0.83)  # measured slopes are -1 to -4
-
-
-def classes_of(image: Image, classes: int) -> Image:
-    """Return the multi-Otsu classes of an image, from 0."""
-    return Image(np.digitize(image.data, class_thresholds(image.data.ravel(), classes)), image.affine)
 
 
 def remeshed(

@@ -28,7 +28,6 @@ from tetopt.io.images import cropped, image_slice
 from tetopt.measure.quality import QualityErrors, quality_errors
 from tetopt.mesh import Mesh
 from tetopt.model.averages import cell_young
-from tetopt.model.mappings import ModulusMapping
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import lattice_mesh
@@ -213,7 +212,7 @@ def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
     return 1.0 / np.maximum(np.abs(strain), floor)
 
 
-def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
+def elastography(snr_db: float | None) -> Image:
     """Approximate modulus 1 / strain of a compressed stiffness phantom, relative to its median; Fig. 3(c).
 
     `prostate_2d` is compressed by 1 %, plane stress, on a mesh of four triangles to every 0.5 mm pixel. The axial
@@ -225,9 +224,8 @@ def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
     young = cell_young(stiffness, fine, average="mean")
     bottom, top = box_faces(stiffness, fine)
     height = stiffness.shape[1] * stiffness.spacing[1]
-    u = compression(
-        fine, young, nu, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.01 * height], is_bonded=False
-    ).u
+    push = [0.0, 0.01 * height]
+    u = compression(fine, young, DEFAULT_NU, fixed_nodes=top, pushed_nodes=bottom, displacement=push, is_bonded=False).u
     axial = strains(fine, u)[:, 1, 1]
     strain = -axial.reshape(*stiffness.shape, 4).mean(axis=2)
     if snr_db is not None:
@@ -286,28 +284,18 @@ class Simulated(NamedTuple):
     young: NDArray[np.float64]  # (M,) kPa
 
 
-def simulate(
-    image: Image,
-    mesh: Mesh,
-    nu: float = DEFAULT_NU,
-    percent: float = 1.0,
-    mapping: ModulusMapping = None,
-    average: str = "mean",
-) -> tuple[Simulated, Compression]:
-    """Top fixed, bottom pushed in by `percent` of the height along the faces' normal, both bonded.
-
-    `mapping` converts intensities to kPa (see `tetopt.model.mappings.young_from`); None: the image is the modulus.
-    `average` averages a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq. (2).
+def simulate(image: Image, mesh: Mesh) -> tuple[Simulated, Compression]:
+    """Top fixed, bottom pushed in by 1 % of the height along the faces' normal, both bonded; the image is the modulus.
 
     Raises
     ------
     InputError
-        The average is unknown, a modulus is not positive, or the mesh does not fill the image's box in one piece.
+        A modulus is not positive, or the mesh does not fill the image's box in one piece.
     """
     bottom, top = box_faces(image, mesh)
     check_fills_box(image, mesh)
-    young = cell_young(image, mesh, mapping, average)
-    push = push_of(image, percent)
-    pressed = compression(mesh, young, nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
+    young = cell_young(image, mesh, average="mean")
+    push = push_of(image, 1.0)
+    pressed = compression(mesh, young, DEFAULT_NU, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
     system = conditioning(pressed.system)
     return Simulated(system.lambda_max, system.cond, system.cg_iterations, pressed.strain_energy, young), pressed

@@ -18,10 +18,11 @@ from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
+from tetopt.measure.segmentation import thresholded
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.study.interfaces import OTSU_CLASSES, interfaces
-from tetopt.study.mmg import classes_of, remeshed
+from tetopt.study.mmg import remeshed
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.system.extras import install_hint
@@ -142,7 +143,7 @@ def mmg(job: PipelineInput) -> Produced:
         As `tetopt.study.mmg.remeshed`.
     """
     seconds: dict[str, float] = {}
-    labels = classes_of(job.image, job.classes) if job.labels is None else job.labels
+    labels = thresholded(job.image, job.classes) if job.labels is None else job.labels
     with _timed(seconds, "tetrahedra"):
         result, of_cell = remeshed(job.image, labels, job.nodes, job.order, job.smoothing)
     return _searched(result, seconds, [])._replace(labels=None if job.labels is None else of_cell)
