@@ -82,11 +82,9 @@ def test_multigrid_and_factorisation_agree(monkeypatch, shape, linear, nu, contr
     modulus = modulus_of(shape, linear, contrast)
     direct, _ = nodes_of(modulus)
     u = direct.copy()
-    assert solve_between_plates(modulus, nu, direct).iterations == 0
+    assert solve_between_plates(modulus, nu, direct) == 0
     multigrid_alone(monkeypatch)
-    work = solve_between_plates(modulus, nu, u)
-    assert 3 < work.iterations < 80
-    assert work.residual < 1e-9
+    assert 3 < solve_between_plates(modulus, nu, u) < 80
     np.testing.assert_allclose(u, direct, atol=1e-7 * np.abs(direct).max())
 
 

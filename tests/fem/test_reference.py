@@ -11,7 +11,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import tetopt
 from tetopt.fem.elasticity import box_faces, compression
-from tetopt.fem.hexahedra import Work, element_stiffness
+from tetopt.fem.hexahedra import element_stiffness
 from tetopt.fem.reference import (
     OwnError,
     Reference,
@@ -103,7 +103,7 @@ def linear_reference(image, slope, shift):
     """A made-up solution u = slope x + shift, against 0 for the homogeneous block."""
     nodes = np.stack(np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1)
     u = image.to_world(nodes.reshape(-1, image.ndim)).reshape(nodes.shape) @ slope.T + shift
-    return Reference(image, 0.3, 2.0, u, np.zeros_like(u), OwnError(0.0, None), Work(0, 0.0))
+    return Reference(image, 0.3, 2.0, u, np.zeros_like(u), OwnError(0.0, None), 0)
 
 
 def test_errors_of_a_known_field():
@@ -181,8 +181,6 @@ def test_averaged_keeps_box_and_mean():
     by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
     np.testing.assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
     np.testing.assert_array_equal(averaged(image, image.shape).data, image.data)
-    with pytest.raises(tetopt.InputError, match="averaged: expected at most"):
-        averaged(image, (8, 10, 9))
 
 
 @pytest.mark.parametrize("shape", [(7, 10, 9), (5, 1, 6)])
@@ -246,13 +244,6 @@ def test_own_error_is_that_of_half_the_resolution():
     assert exact.own_error.displacement > 0.01
 
 
-@pytest.mark.parametrize(("value", "nu", "words"), [(0.0, 0.3, "above 0 kPa"), (1.0, 0.5, "nu: expected")])
-def test_refuses(value, nu, words):
-    image = tetopt.Image(np.where(np.arange(8).reshape(2, 2, 2) == 3, value, 1.0))
-    with pytest.raises(tetopt.InputError, match=words):
-        reference(image, nu)
-
-
 def test_homogeneous_block_has_no_displacement_error():
     image = tetopt.Image(np.full((6, 5, 4), 3.0))
     mesh = tetopt.lattice_mesh(image, nodes=40)
@@ -301,3 +292,9 @@ def test_nearest_to_a_coarser_grid():
     image = tetopt.Image(np.arange(8.0)[:, None] * np.ones((1, 6)))
     coarse = tetopt.Image(np.zeros((2, 3)))
     np.testing.assert_array_equal(nearest(image, coarse).data[:, 0], [2.0, 6.0])
+
+
+def test_refuses_a_modulus_of_0():
+    image = tetopt.Image(np.where(np.arange(8).reshape(2, 2, 2) == 3, 0.0, 1.0))
+    with pytest.raises(tetopt.InputError, match="above 0 kPa"):
+        reference(image, 0.3)

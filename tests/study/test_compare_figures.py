@@ -8,7 +8,6 @@ from test_compare_page import fake_report, finished, meshes_of, with_runs
 
 import tetopt
 from tetopt.energy.discretization import cell_E_D
-from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView
 from tetopt.study.compare_figures import cutaways, histograms_figure, labels_figure, slices_figure, timing_figure
@@ -42,12 +41,6 @@ def test_slices_hold_means_and_losses(small, n_meshes):
         np.testing.assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
     assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1  # one scale for all
     assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {grid[0, 0].images[0].get_clim()}
-
-
-def test_slices_refuse_missing_means(small):
-    image, both = small
-    with pytest.raises(InputError, match="got 0 arrays of means for 2 meshes; give one for each"):
-        slices_figure(image, both, [])
 
 
 def test_label_marks_are_those_of_the_report():

@@ -92,12 +92,6 @@ def test_missed_count_is_told(monkeypatch):
     assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild; requested: 900"]
 
 
-@needs_pytetwild
-def test_too_few_nodes():
-    with pytest.raises(tetopt.InputError, match="nodes: a box needs 8 or more, got 7"):
-        tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 7)
-
-
 def test_missing_package(monkeypatch):
     """One that is not there, and one that cannot be imported."""
     monkeypatch.setitem(sys.modules, "pytetwild", None)

@@ -76,14 +76,7 @@ def run_in_child(
     -------
     Outcome
         Crashes, the time and memory limits, exceptions and missing packages are a `failure`, not an exception.
-
-    Raises
-    ------
-    InputError
-        A limit is not above 0.
     """
-    if not max_seconds > 0.0 or (max_bytes is not None and max_bytes <= 0):
-        raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
     first = _run_once(pipeline, job, max_seconds, max_bytes)
     if not first.is_crash:
         return first

@@ -305,7 +305,7 @@ def _reference_grid(standard: Standard) -> records.ReferenceGrid:
     is_same = standard.modulus.shape == standard.image.shape
     note = "one hexahedron per voxel" if is_same else "the modulus averaged over a coarser grid, also for meshes"
     by_nu = {
-        nu: records.ReferenceEnergy(each.strain_energy, each.own_error, each.work.iterations)
+        nu: records.ReferenceEnergy(each.strain_energy, each.own_error, each.n_iterations)
         for nu, each in standard.references.items()
     }
     return records.ReferenceGrid(standard.modulus.shape, first.n_dofs, note, by_nu)

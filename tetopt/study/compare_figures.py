@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tetopt.energy.discretization import cell_E_D
-from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -36,7 +35,7 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     ----------
     image : Image
     meshes : sequence of (title, Mesh)
-        One column each.
+        One column each; at least one.
     means : sequence of (M,) float64
         Values that fill each mesh's cells, in the image's grey range.
 
@@ -46,14 +45,7 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
         Three rows: edges over the image; cells filled with their means; E_D per mm^3 of each cell (the variance of
         the image inside it) on a common scale, so that a dark map is a good fit for any cell size. Where a mesh does
         not cover the image, the lower rows are light blue.
-
-    Raises
-    ------
-    InputError
-        There are no meshes, or their number differs from that of means.
     """
-    if not meshes or len(meshes) != len(means):
-        raise InputError(f"slices_figure: got {len(means)} arrays of means for {len(meshes)} meshes; give one for each")
     view = SliceView(image, None, None)
     width = 3.3 if len(meshes) > 2 else 4.6
     figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")

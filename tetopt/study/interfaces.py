@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from tetopt.contents.otsu import class_thresholds
-from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 
@@ -54,7 +53,7 @@ def interfaces(
     image : Image
         3-D.
     size : float
-        Edge length of the mesh in mm, near the interfaces.
+        Edge length of the mesh in mm, above 0, near the interfaces.
     classes : int
         Number of classes without labels, 2 or more.
     labels : Image, optional
@@ -69,10 +68,8 @@ def interfaces(
     Raises
     ------
     InputError
-        The image is not 3-D; labels have another shape or are not whole numbers; the size is not above 0; the
-        intensities do not have so many classes (see `tetopt.contents.otsu.class_thresholds`).
+        The intensities do not have so many classes (see `tetopt.contents.otsu.class_thresholds`).
     """
-    _check(image, size, labels)
     if labels is None:
         pieces, notes = _isosurfaces(image, size, classes, smoothing)
     else:
@@ -102,19 +99,6 @@ def _classes(image: Image, classes: int, smoothing: float = 1.0) -> tuple[NDArra
     """Return the smoothed volume and the thresholds between its classes."""
     smooth = gaussian_filter(image.data, smoothing * SIGMA_VOXELS, mode="nearest")
     return smooth, class_thresholds(smooth.ravel(), classes)
-
-
-def _check(image: Image, size: float, labels: Image | None) -> None:
-    if image.ndim != 3:
-        raise InputError(f"image: surfaces need 3 axes, got shape {image.shape}; select a volume")
-    if not (np.isfinite(size) and size > 0.0):
-        raise InputError(f"size: expected a length above 0 mm, got {size}")
-    if labels is None:
-        return
-    if labels.shape != image.shape:
-        raise InputError(f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample them")
-    if not labels.is_whole:
-        raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
 
 
 def _isosurfaces(image: Image, size: float, classes: int, smoothing: float) -> tuple[list[pyvista.PolyData], list[str]]:

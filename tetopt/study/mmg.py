@@ -55,10 +55,8 @@ def remeshed(
     Raises
     ------
     InputError
-        mmgpy is not installed; fewer than 8 nodes are requested; Mmg built no mesh.
+        mmgpy is not installed; Mmg built no mesh.
     """
-    if nodes < 8:
-        raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     mmgpy = imported("mmgpy")
     spacing = node_spacing(image, corners_for(nodes, order))
 

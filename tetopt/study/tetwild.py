@@ -85,11 +85,9 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
     Raises
     ------
     InputError
-        pytetwild is not installed; fewer than 8 nodes are requested; no run's boundary could be moved onto the box
+        pytetwild is not installed; no run's boundary could be moved onto the box
         without inverting a cell.
     """
-    if nodes < 8:
-        raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     tetrahedralize = imported("pytetwild").tetrahedralize
     spacing = node_spacing(image, corners_for(nodes, order))
 
