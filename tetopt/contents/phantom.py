@@ -456,11 +456,10 @@ class Phantom:
         `offsets` (S, n) lead from a centre to its sub-voxels' midpoints; no point of a voxel is farther from
         its centre than `reach`.
         """
-        lowest, near = self._shapes_near(centers, reach)
-        top = np.full(len(centers), lowest)  # last shape that contains the centre
-        base = np.full(len(centers), lowest)  # last shape that contains the whole voxel
+        top = np.zeros(len(centers), dtype=np.int64)  # last shape that contains the centre
+        base = np.zeros(len(centers), dtype=np.int64)  # last shape that contains the whole voxel
         is_cut = np.zeros((len(self.shapes), len(centers)), dtype=bool)
-        for k, shape in near:
+        for k, shape in enumerate(self.shapes, start=1):
             distance = signed_distance(shape, centers)
             top[distance <= 0.0] = k
             base[distance < -reach] = k
@@ -475,7 +474,7 @@ class Phantom:
         for start in range(0, len(cut), step):
             voxels = cut[start : start + step]
             paint = np.repeat(base[voxels, None], len(offsets), axis=1)
-            for k, shape in near:
+            for k, shape in enumerate(self.shapes, start=1):
                 rows = np.flatnonzero(is_cut[k - 1, voxels])
                 if rows.size == 0:
                     continue
@@ -485,24 +484,6 @@ class Phantom:
             # Relative to the first sub-voxel, so that a uniform voxel keeps its value to the last bit.
             means[voxels] = values[:, 0] + (values - values[:, :1]).mean(axis=1)
         return means
-
-    def _shapes_near(self, centers: NDArray[np.float64], reach: float) -> tuple[int, list[tuple[int, Shape]]]:
-        """The last shape that contains all voxels with these centres, and later shapes that meet any of them.
-
-        It takes a single distance from the middle of all, as most boxes of a large image lie within one shape.
-        """
-        middle = (centers[0] + centers[-1]) / 2
-        # The 1e-9 allows for the rounding of distances.
-        radius = (np.linalg.norm(centers - middle, axis=1).max() + reach) * (1.0 + 1e-9)
-        lowest: int = 0
-        near: list[tuple[int, Shape]] = []
-        for k, shape in enumerate(self.shapes, start=1):
-            distance = signed_distance(shape, middle)
-            if distance < -radius:
-                lowest, near = k, []
-            elif distance <= radius:
-                near.append((k, shape))
-        return lowest, near
 
 
 class PhantomVoxels:

@@ -12,14 +12,13 @@ from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tetopt.contents.phantom import load_phantom
 from tetopt.energy.discretization import E_D, combined
 from tetopt.energy.geometric import E_G
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.paper import optimize_paper
-from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import Compression, box_faces, check_fills_box, compression, push_of, strains
 from tetopt.geometry.simplex import rho
@@ -179,39 +178,6 @@ def _cropped_to_content(image: Image, proportions: tuple[int, ...]) -> Image:
     return cropped(image, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
 
 
-def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
-    """1 / strain, an approximation of the elastic modulus from a strain map (Section 3), float64.
-
-    For a uniform stress this is the modulus in units of the stress: in kPa under a stress of 1 kPa.
-
-    Parameters
-    ----------
-    strain : array of real numbers
-        Compression or extension; only the absolute value is used.
-    floor : float
-        Smaller strains, including noise, are raised to this value, so the modulus is at most 1 / floor.
-
-    Raises
-    ------
-    InputError
-        A strain is not finite, or `floor` is not above 0.
-
-    Examples
-    --------
-    >>> inverse_strain([0.02, -0.01, 0.0], floor=0.001)
-    array([  50.,  100., 1000.])
-    """
-    strain = np.asarray(strain, dtype=np.float64)
-    if not (np.isfinite(floor) and floor > 0.0):
-        raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
-    if not np.isfinite(strain).all():
-        raise InputError(
-            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them (with 0 where the "
-            "tissue is stiff)"
-        )
-    return 1.0 / np.maximum(np.abs(strain), floor)
-
-
 def elastography(snr_db: float | None) -> Image:
     """Approximate modulus 1 / strain of a compressed stiffness phantom, relative to its median; Fig. 3(c).
 
@@ -231,7 +197,7 @@ def elastography(snr_db: float | None) -> Image:
     if snr_db is not None:
         noise = strain.mean() * 10.0 ** (-snr_db / 20.0)
         strain = strain + np.random.default_rng(0).normal(0.0, noise, strain.shape)
-    modulus = inverse_strain(strain, floor=0.2 * float(np.median(strain)))
+    modulus = 1.0 / np.maximum(np.abs(strain), 0.2 * float(np.median(strain)))
     return Image(modulus / np.median(modulus), stiffness.affine)
 
 
