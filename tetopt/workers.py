@@ -48,10 +48,6 @@ class UnfitWorker(InputError):
 class WorkerEnded(InputError):
     """A worker ended each time that it ran a task."""
 
-    def __init__(self, times: int, reason: str) -> None:
-        super().__init__(f"its worker ended, {times} times, {reason}")
-        self.times = times
-
 
 class Share(NamedTuple):
     """The division of this machine."""
@@ -232,7 +228,7 @@ def _error_of(client: Any, future: Any) -> BaseException | None:
     at_limit = {event["worker"] for _, event in client.get_events(MEMORY_TOPIC)}
     reason = "because it exceeded" if last.address in at_limit else "possibly because it exceeded"
     limit = f"its limit of {memory_words(last.memory_limit)}" if last.memory_limit else "the available memory"
-    return WorkerEnded(error.allowed_failures + 1, f"{reason} {limit}")
+    return WorkerEnded(f"its worker ended, {error.allowed_failures + 1} times, {reason} {limit}")
 
 
 def _check_scheduler(address: str) -> None:

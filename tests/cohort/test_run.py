@@ -162,7 +162,11 @@ def test_a_subject_beyond_its_workers_memory_is_not_begun(task, monkeypatch):
 def test_failures_are_recorded_and_forgotten(tmp_path, monkeypatch, task):
     """Of a subject, of its worker, and of an earlier run."""
     names = [task._replace(key=f"sub-{k}") for k in range(3)]
-    errors = {"sub-1": None, "sub-2": WorkerEnded(2, "possibly because it exceeded its limit of 0.4 GB"), "sub-0": None}
+    errors = {
+        "sub-1": None,
+        "sub-2": WorkerEnded("its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"),
+        "sub-0": None,
+    }
     ended = [run_module.Ended("sub-0", "done", "", 1.0, 1), run_module.Ended("sub-1", "failed", "cut short", 1.0, 0)]
     failure_path(task.out, "sub-0").write_text("{}")
 

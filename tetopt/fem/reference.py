@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.sparse import csr_array
 
+from tetopt.contents.align import divided
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
@@ -199,7 +200,10 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
         rows = np.moveaxis(data, axis, 0)
         means = _fractions(new, old) @ rows.reshape(old, -1)
         data = np.moveaxis(means.reshape(new, *rows.shape[1:]), 0, axis)
-    return _over_same_box(image, data)
+    n, size = image.ndim, np.array(image.shape) / np.array(shape)
+    scaling = np.diag([*size, 1.0])
+    scaling[:n, n] = (size - 1.0) / 2.0
+    return Image(data, image.affine @ scaling)
 
 
 def _fractions(new: int, old: int) -> csr_array:
@@ -229,19 +233,7 @@ def refined(image: Image, shape: tuple[int, ...]) -> Image:
     centres of another grid (`nearest`) use some voxels more often: MNI152 at 2 mm, sampled at 1 mm, has a mean modulus
     that is 0.6 % too high, as large as the measured errors.
     """
-    data = image.data
-    parts = [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)]
-    for axis, count in enumerate(parts):
-        data = np.repeat(data, count, axis=axis)
-    return _over_same_box(image, data)
-
-
-def _over_same_box(image: Image, data: NDArray) -> Image:
-    """An image with other voxels that fill the same box."""
-    n, size = image.ndim, np.array(image.shape) / np.array(data.shape)
-    scaling = np.diag([*size, 1.0])
-    scaling[:n, n] = (size - 1.0) / 2.0
-    return Image(data, image.affine @ scaling)
+    return divided(image, [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)])
 
 
 def nearest(image: Image, grid: Image) -> Image:
