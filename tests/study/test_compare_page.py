@@ -316,7 +316,7 @@ def test_failures_are_named(tmp_path):
     assert close(meshes["pytetwild"]["Cost", "nodes"][0], 5011)
     assert "<li>pytetwild: a run failed: out of time: killed after 4 s</li>" in page
     assert "<li>BCC lattice: not compressed: the mesh does not fill the box</li>" in page
-    assert "<li>BCC lattice, quadratic cells: not compressed: the mesh does not fill the box</li>" in page
+    assert "<li>BCC lattice, quadratic: not compressed: the mesh does not fill the box</li>" in page
     assert meshes["BCC lattice"]["Error of the compression, ν = 0.3", "energy"] == ["–"]
 
 

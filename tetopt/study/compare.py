@@ -264,7 +264,7 @@ def _attempt(
     comparison: Comparison, standard: Standard, pipeline: Pipeline, order: int
 ) -> tuple[Outcome, tuple[records.PipelineRun, MadeMesh] | None]:
     """Run a pipeline once and measure its mesh; return the outcome, and the run unless it failed."""
-    settings, title = comparison.settings, pipeline.title + (", quadratic" if order == 2 else "")
+    settings, title = comparison.settings, pipeline.title + records.MESH_WORDS[order]
     note(f"{title}, {settings.nodes} nodes")
     job = PipelineInput(
         comparison.image, comparison.labels, settings.nodes, settings.classes, settings.k_D, settings.iterations, order

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tetopt.report.page import package_text, rendered, write_page
-from tetopt.study.compare_report import ORDER_WORDS, Report
+from tetopt.study.compare_report import Report
 from tetopt.study.compare_table import columns_of, number_text, rows_of
 
 
@@ -35,14 +35,12 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
 def remarks(report: Report) -> list[str]:
     """Return lines on runs that failed or crashed, on meshes that were not compressed, and the notes of the runs."""
     lines = []
-    for order, pipelines in ((1, report.pipelines), (2, report.quadratic)):
-        for each in pipelines:
-            title = each.title if order == 1 else f"{each.title}, {ORDER_WORDS[order]} cells"
-            if each.failure is not None and each.median is not None:
-                lines.append(f"{title}: a run failed: {each.failure}")
-            if each.median is not None and each.median.measurement.not_compressed is not None:
-                lines.append(f"{title}: not compressed: {each.median.measurement.not_compressed}")
-            lines += [f"{title}: {note}" for note in each.notes]
+    for title, each in report.meshes():
+        if each.failure is not None and each.median is not None:
+            lines.append(f"{title}: a run failed: {each.failure}")
+        if each.median is not None and each.median.measurement.not_compressed is not None:
+            lines.append(f"{title}: not compressed: {each.median.measurement.not_compressed}")
+        lines += [f"{title}: {note}" for note in each.notes]
     return lines
 
 

@@ -16,6 +16,7 @@ from tetopt.study.program import Program
 # The file is flatter than the records: the keys of these fields' values are among those of the record itself.
 INLINE_FIELDS = ("measurement", "source", "by_nu")
 ORDER_WORDS = {1: "linear", 2: "quadratic"}
+MESH_WORDS = {1: "", 2: ", quadratic"}  # after the title of a pipeline, by order
 
 
 class Settings(NamedTuple):
@@ -158,6 +159,11 @@ class Report(NamedTuple):
     pipelines: list[PipelineResult]  # meshes of the requested number of nodes, with linear cells
     quadratic: list[PipelineResult]  # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
     seconds: float
+
+    def meshes(self) -> list[tuple[str, PipelineResult]]:
+        """Return the title and the result of each mesh, those of linear cells first."""
+        of_order = {1: self.pipelines, 2: self.quadratic}
+        return [(each.title + MESH_WORDS[order], each) for order, results in of_order.items() for each in results]
 
 
 def as_json(value: Any) -> Any:

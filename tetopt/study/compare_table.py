@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from tetopt.measure.fidelity import LabelFidelity
-from tetopt.study.compare_report import ORDER_WORDS, Measurement, PipelineResult, PipelineRun, Report
+from tetopt.study.compare_report import Measurement, PipelineResult, PipelineRun, Report
 
 JUDGED_VOXELS = 500  # labels with more are judged; a mesh of few nodes keeps only some smaller ones
 MEBI_BYTES = 1e-6  # megabytes in a byte
@@ -49,7 +49,7 @@ class TableRow(NamedTuple):
 
 def columns_of(report: Report) -> list[Column]:
     """Return the columns for which any mesh has a number, in order."""
-    runs = [run for each in [*report.pipelines, *report.quadratic] for run in each.runs]
+    runs = [run for _, each in report.meshes() for run in each.runs]
     ratios = sorted({nu for run in runs for nu in run.measurement.fem}, key=float)
     columns = [
         _measure("Fidelity", "E_D, of the variance", lambda mesh: mesh.E_D_fraction, -1, is_short=True),
@@ -136,11 +136,7 @@ def _error(nu: str, name: str) -> Value:
 
 def rows_of(report: Report, columns: list[Column]) -> list[TableRow]:
     """Return a row for each pipeline's mesh of linear cells, and then of quadratic ones."""
-    return [
-        _row(each, each.title if order == 1 else f"{each.title}, {ORDER_WORDS[order]}", columns)
-        for order, pipelines in ((1, report.pipelines), (2, report.quadratic))
-        for each in pipelines
-    ]
+    return [_row(each, title, columns) for title, each in report.meshes()]
 
 
 def _row(pipeline: PipelineResult, title: str, columns: list[Column]) -> TableRow:
