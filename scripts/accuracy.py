@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.io.mni import mni_path
-from tetopt.study.mmg import classes_of
+from tetopt.measure.segmentation import thresholded
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.files import checked_output, save_json
 
@@ -101,7 +101,7 @@ def _pytetwild(image: tetopt.Image) -> Mesher:
 
 def _cgal(program: str, image: tetopt.Image, folder: Path) -> Mesher:
     """Return CGAL as a mesher of the image's classes, with one cell size."""
-    labels = classes_of(image, 4)
+    labels = thresholded(image, 4)
     raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")  # CGAL leaves out label 0
     grid = written_labels(folder / "labels.raw", raised, labels)
 
@@ -142,7 +142,7 @@ def same_dice(path: Path, cgal: str) -> dict[str, Any]:
         process_seconds(command)
         seconds = time.perf_counter() - begin
         mesh, of_cell = mesh_of(folder / "mesh.bin", labels)
-        rows: dict[str, Any] = {"cgal": {"nodes": len(mesh.points), "seconds": seconds}}
+        rows: dict[str, Any] = {"counts": HEAD_COUNTS, "cgal": {"nodes": len(mesh.points), "seconds": seconds}}
         rows["cgal"]["dice"] = dice = _dice(labels, mesh, of_cell)
         for nodes in HEAD_COUNTS:
             begin = time.perf_counter()

@@ -6,7 +6,7 @@
 DATA is a folder with the images of `FILES`. Each measurement runs its commands one after the other, in a folder of its
 own, and replaces its entry in docs/measured/measured.json, with version, commit, date and machine. Pages are written
 from scripts/templates and that file (`--pages`: without measuring). Leave the machine idle: the whole takes an
-hour and a half on two cores, with CGAL.
+two hours on two cores, with CGAL.
 """
 
 from __future__ import annotations
@@ -222,6 +222,10 @@ MEASUREMENTS = {
     "curved": Measurement(
         ("python tests/benchmarks/curved_cells.py -o curved.json $HIPPOCAMPUS",),
         listed("curved.json"),
+    ),
+    "accuracy": Measurement(
+        ("python scripts/accuracy.py -o accuracy.json $T1 --cgal $CGAL --head $HEAD --cgal-sized $CGAL_SIZED --force",),
+        listed("accuracy.json"),
     ),
     "speed": Measurement(
         ("python scripts/benchmark.py -o bench.json --cgal $CGAL --cgal-sized $CGAL_SIZED --head $HEAD --force",),
