@@ -141,18 +141,6 @@ def test_a_link_that_is_turned_during_the_run_changes_nothing(tmp_path):
 # Within a command
 
 
-def test_what_another_program_wrote_meanwhile_stays(tmp_path):
-    path = tmp_path / "a.nii.gz"
-    with outputs_of_command() as outputs:
-        checked_output(path, NIFTI)
-        path.write_text("theirs")
-        with pytest.raises(InputError, match="in the meantime; pass `force`"):
-            save_bytes(path, b"ours")
-    assert outputs.written == []
-    assert path.read_text() == "theirs"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_a_new_output_appears_and_may_be_written_again(tmp_path):
     path = tmp_path / "a.vtu"
     with outputs_of_command() as outputs:
@@ -162,15 +150,6 @@ def test_a_new_output_appears_and_may_be_written_again(tmp_path):
             assert path.read_bytes() == text
     assert outputs.written == [path]  # told once
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_force_replaces_what_came_meanwhile(tmp_path):
-    path = tmp_path / "a.vtu"
-    with outputs_of_command():
-        checked_output(path, VTU, force=True)
-        path.write_text("theirs")
-        save_bytes(path, b"ours")
-    assert path.read_text() == "ours"
 
 
 def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):

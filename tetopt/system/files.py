@@ -32,7 +32,6 @@ class Outputs(NamedTuple):
     """The outputs of one command."""
 
     named: list[Path]  # all files and folders that its options name, including inputs
-    may_replace: dict[Path, bool]  # for each checked output, whether it may replace an existing file
     places: dict[Path, Path]  # for each checked output, its real place with links followed
     written: list[Path]  # checked outputs that have been written
     made: list[Path]  # folders created for the outputs
@@ -45,10 +44,10 @@ _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 def outputs_of_command() -> Iterator[Outputs]:
     """Treat the outputs checked by `checked_output` within a block as those of one command.
 
-    An output must not be one of the inputs, nor the same as another output. A file that appeared after the check is
-    not replaced without `force`. Folders made by `results_folder` that are empty at the end are removed.
+    An output must not be one of the inputs, nor the same as another output. Folders made by `results_folder` that are
+    empty at the end are removed.
     """
-    outputs = Outputs([], {}, {}, [], [])
+    outputs = Outputs([], {}, [], [])
     token = _OUTPUTS.set(outputs)
     try:
         yield outputs
@@ -134,7 +133,6 @@ def checked_output(
     _check_once(path, place)
     _check_folder(path, place.parent)
     if (outputs := _OUTPUTS.get()) is not None:
-        outputs.may_replace[_absolute(path)] = force
         outputs.places[_absolute(path)] = place
     return path
 
@@ -187,21 +185,18 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
 
     Raises
     ------
-    InputError
-        A file has appeared there since `checked_output`.
     OSError
-        Any other failure, with the path and, on a full disk, the number of bytes (`n_bytes`) if known.
+        Any failure, with the path and, on a full disk, the number of bytes (`n_bytes`) if known.
     """
     # Not `path.suffixes`, which skips leading dots: for "..nii.gz" it has only .gz.
     suffix = "".join(f".{part}" for part in path.name.split(".")[1:][-2:])[-20:]
-    with _output(path, n_bytes) as (place, may_replace):
+    with _output(path, n_bytes) as place:
         handle, name = tempfile.mkstemp(prefix=_hidden(path), suffix=suffix, dir=place.parent)
         os.close(handle)
         temporary = Path(name)
         try:
             yield temporary
             _on_disk(temporary, place)
-            _check_free(path, place, may_replace)
             os.replace(temporary, place)
             _synchronise_folder(place.parent)
         finally:
@@ -209,26 +204,18 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
                 os.unlink(temporary)
 
 
-def _check_free(path: Path, place: Path, may_replace: bool) -> None:
-    """Raise InputError if something has appeared in an output's place that it may not replace."""
-    if not may_replace and os.path.lexists(place):
-        raise InputError(f"{path}: another program has written this in the meantime; pass `force` to replace it")
-
-
 @contextmanager
-def _output(path: Path, n_bytes: int | None = None) -> Iterator[tuple[Path, bool]]:
-    """Give an output's real place and whether it may replace an existing file; record it as written after the block.
+def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
+    """Give an output's real place; record it as written after the block.
 
     System errors within the block are reported as errors of writing `path`.
     """
     outputs, key = _OUTPUTS.get(), _absolute(path)
     place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
     with telling(path, n_bytes, place.parent):
-        yield place, outputs is None or outputs.may_replace.get(key, True)
-    if outputs is not None and key in outputs.places:
-        outputs.may_replace[key] = True
-        if path not in outputs.written:  # a mesh is written first, and again with its measurements
-            outputs.written.append(path)
+        yield place
+    if outputs is not None and key in outputs.places and path not in outputs.written:
+        outputs.written.append(path)  # once: a mesh is written first, and again with its measurements
 
 
 def _hidden(path: Path) -> str:
@@ -252,19 +239,16 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    InputError
-        Something has appeared there since `checked_output`.
     OSError
         As `written_whole`.
     """
-    with ExitStack() as stack, _output(path) as (place, may_replace):
+    with ExitStack() as stack, _output(path) as place:
         temporary = _temporary_folder(stack, path, place.parent, path.suffix[-20:])
         yield temporary
         for folder, _, names in os.walk(temporary):
             for name in names:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
-        _check_free(path, place, may_replace)
         old = None
         if place.is_dir():
             old = _temporary_folder(stack, path, place.parent) / "old"
