@@ -9,7 +9,6 @@ parent that is killed.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
@@ -30,7 +29,6 @@ except ImportError:  # Windows
 POLL_SECONDS = 0.05  # between two polls of a child: a fraction of even a short run
 KILL_ROUNDS = 40  # searches for remaining processes, `POLL_SECONDS` apart: a killed process may have forked before
 MARK_NAME = "TETOPT_CHILD"  # names the child's folder in the environment of every process that a child starts
-DEATH_OPTION = 1  # PR_SET_PDEATHSIG of prctl(2)
 # Waits until its standard input closes, which happens when the parent ends for any reason.
 WATCHDOG = 'read -r _; kill -9 -"$1"; sleep 0.2; rm -rf "$2"'
 # Signals of a crash; a shell that ran the program then exits with 128 more.
@@ -184,16 +182,6 @@ def limit_self(name: str, value: float) -> None:
     hard = resource.getrlimit(kind)[1]
     with contextlib.suppress(ValueError, OSError):  # macOS has no such memory limit
         resource.setrlimit(kind, (int(value if hard == resource.RLIM_INFINITY else min(value, hard)), hard))
-
-
-def end_with_parent() -> None:
-    """On Linux, have this process killed as soon as its parent ends; elsewhere do nothing.
-
-    If a thread started the process, the end of that thread counts. Without this, a process notices the end of its
-    parent only when it checks, which it does not do within a compiled kernel.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(DEATH_OPTION, signal.SIGKILL)
 
 
 # How it ended
