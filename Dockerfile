@@ -15,7 +15,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY phantoms ./phantoms
 COPY tetopt ./tetopt
 RUN python -m pip install --no-cache-dir --disable-pip-version-check ".[cohort,itk]"
-# Into the folders of the installed package, from which any user reads them: nothing has to be written when it runs.
+# Next to the installed package, from where any user copies them to a cache, or to a temporary folder.
 RUN tetopt warm-up
 
 WORKDIR /

@@ -1,8 +1,7 @@
 """Available memory, and checks that reject work that needs more, before it starts.
 
-Limits of a process (RLIMIT_AS, RLIMIT_DATA, as `ulimit` and schedulers set them) make an allocation fail. The limits of
-a control group (containers, clusters) and of the machine kill the process without a message, so they must be checked
-in advance.
+The limits of a control group (containers, clusters) and of the machine kill a process without a message, so they must
+be checked in advance. Those of a process (`ulimit -v`) make an allocation fail, which is reported when it happens.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ def available_bytes() -> int:
     """Return the memory available without swapping, within all limits."""
     import psutil
 
-    rooms = [psutil.virtual_memory().available, _group_bytes(), *_process_bytes()]
-    return max(0, min(room for room in rooms if room is not None))
+    free, of_group = psutil.virtual_memory().available, _group_bytes()
+    return max(0, free if of_group is None else min(free, of_group))
 
 
 def resident_bytes() -> int:
@@ -133,28 +132,6 @@ def family_peak_bytes() -> int:
 
 def _maxrss(who: int) -> int:
     return resource.getrusage(who).ru_maxrss * MAXRSS_UNIT_BYTES
-
-
-def address_room() -> int | None:
-    """Return the address space that this process may still take; None without a limit."""
-    rooms = _process_bytes()
-    return min(rooms, default=None)
-
-
-def _process_bytes() -> list[int]:
-    """Return what each limit set on this process leaves."""
-    names = {"RLIMIT_AS": "vms", "RLIMIT_DATA": "data"}
-    limits = {used: resource.getrlimit(getattr(resource, name))[0] for name, used in names.items() if resource}
-    if all(limit == resource.RLIM_INFINITY for limit in limits.values()):
-        return []
-    import psutil
-
-    used_bytes = psutil.Process().memory_info()._asdict()
-    return [
-        limit - used_bytes[used]
-        for used, limit in limits.items()
-        if limit != resource.RLIM_INFINITY and used in used_bytes
-    ]
 
 
 def _group_bytes() -> int | None:

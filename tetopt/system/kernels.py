@@ -38,7 +38,6 @@ from numba import types
 from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
-from tetopt.system.budget import address_room
 from tetopt.system.cache import place_cache
 from tetopt.system.child import started
 from tetopt.system.interpreter import python_command, python_environment
@@ -62,7 +61,6 @@ Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
 Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
-UNIT_BYTES = 1 << 25  # for all arrays that units allocate at a time: a few KB each on each thread
 # In the cache's folder, shared by all runs of this installation: other installations compile other files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parents[1]).encode()):08x}.lock"
 PIECES_PER_THREAD = 8  # pieces of a plain loop, as some take longer than others
@@ -196,7 +194,6 @@ class Kernel:
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: links the units that it calls, and lays out records."""
         self.link()
-        _check_room()
         return self.dispatcher(*map(packed, values))
 
     @cached_property
@@ -288,13 +285,6 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
                 if inner not in parts:
                     parts.append(inner)
     return parts
-
-
-def _check_room() -> None:
-    """Raise MemoryError if a limit leaves too little for the arrays that units allocate, all of which are small."""
-    room = address_room()
-    if room is not None and room < UNIT_BYTES:
-        raise MemoryError(f"{room} bytes are left for kernels, which need {UNIT_BYTES}")
 
 
 # Compilation in several processes.
@@ -454,7 +444,6 @@ def run(task: Any, n: int, values: Any) -> None:
             task(values, number)
         return
     task.link()
-    _check_room()
     if links() is None:
         n_failed = _run_plain(task, n, values)
     else:
