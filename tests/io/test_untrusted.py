@@ -170,19 +170,25 @@ def legacy(points=4, cells=1, numbers=5, more=""):
     ).encode()
 
 
+# Entities of ten of the one before, as the name of an array.
+ENTITIES = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
+DOCTYPE = f'<?xml version="1.0"?><!DOCTYPE VTKFile [<!ENTITY a0 "ha">{ENTITIES}]>'
+LAUGHS = vtu(head=struct.pack("<Q", 96)).replace(b'<?xml version="1.0"?>', DOCTYPE.encode())
+LAUGHS = LAUGHS.replace(b'Name="Points"', b'Name="&a9;"')
 VTK_BOMBS = {
-    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, but its .* at most"),
-    "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "NumberOfPoints is -4"),
+    "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), "damaged"),
+    "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "damaged"),
     "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
-    "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "NumberOfTuples is"),
+    "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "damaged"),
     "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed on"),
     "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed on"),
-    "entity.vtu": (b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VTKFile/>', "document type or entities"),
-    "points.vtk": (legacy(points=2**31 - 1), "POINTS is 2147483647, but its 146 bytes can hold at most 146"),
-    "cells.vtk": (legacy(cells=2**60), "CELLS is"),
-    "minus.vtk": (legacy(points=-1), "POINTS is -1"),
+    "entity.vtu": (LAUGHS, "damaged"),
+    "empty.vtu": (b"", "damaged"),
+    "points.vtk": (legacy(points=2**31 - 1), "damaged, or not a VTK mesh .*allocate"),
+    "cells.vtk": (legacy(cells=2**60), "damaged"),
+    "minus.vtk": (legacy(points=-1), "damaged"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),
-    "field.vtk": (legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"), "is 2147483647"),
+    "field.vtk": (legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"), "damaged"),
     "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed on this file .SIG"),
 }
 
