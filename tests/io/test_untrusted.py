@@ -260,8 +260,16 @@ def nrrd(dimension="3", sizes="3 4 5", kind="uchar", more="", encoding="raw", da
     return head.encode() + data
 
 
+PACKED_MHA = "CompressedData = True\n"
 ITK_BOMBS = {
     "good.mha": (mha(), None),
+    "zlib.mha": (mha(more=PACKED_MHA, data=zlib.compress(bytes(60))), None),
+    "gzip.mha": (mha(more=PACKED_MHA, data=gzip.compress(bytes(60))), None),
+    "half.mha": (
+        mha(sizes="3 4 10", more=PACKED_MHA, data=zlib.compress(bytes(60))),
+        "declares 120 bytes of voxels, but 60 are packed",
+    ),
+    "flat.mha": (mha(more=PACKED_MHA), "truncated or damaged; copy it again .*while decompressing"),
     "good.nrrd": (nrrd(), None),
     "axes.mha": (mha(ndims="-1"), "expected 1 to 8 axes, got -1"),
     "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
@@ -271,7 +279,7 @@ ITK_BOMBS = {
         mha(sizes="32767 32767 32767"),
         r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, but the file",
     ),
-    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "declares 32767 x"),
+    "packed.mha": (mha(sizes="32767 32767 32767", more=PACKED_MHA), "declares 32767 x"),
     "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "declares 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "unknown voxel type MET_OTHER"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),

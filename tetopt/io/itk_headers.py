@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import re
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room
+from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room, one_line
 from tetopt.system.incoming import irregular
 
 NRRD_SUFFIXES = (".nrrd", ".nhdr")
@@ -22,6 +23,7 @@ HEADER_BYTES = 2**20  # at most in a header: 3D Slicer's long ones have 10,000
 MOST_AXES = 8  # more than space, time and components
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
 VALUE_LETTERS = 32  # letters of text per byte of a value, at most
+BLOCK_BYTES = 2**14  # unpacked at a time, to 17 MB at most
 BZIP2_RATIO = 50_000  # bzip2 compresses zeros 45,000 times
 VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of MetaImage
     "char": 1, "int8": 1, "int8_t": 1, "short": 2, "short int": 2, "int16": 2, "int16_t": 2, "int": 4, "int32": 4,
@@ -55,6 +57,8 @@ def checked_header(path: Path) -> tuple[VoxelHeader, int]:
     """
     header = read_header(path)
     n_bytes = _checked_bytes(path, header)
+    if header.ratio == DEFLATE_RATIO and path.suffix.lower() not in NRRD_SUFFIXES:
+        _check_packed(path, header)
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1), READ_IN_PARTS)
     return header, n_bytes
 
@@ -74,6 +78,24 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
     if n_bytes > most:  # its checksum would cover all of it
         raise InputError(TOO_LONG.format(most))
     return n_bytes
+
+
+def _check_packed(path: Path, header: VoxelHeader) -> None:
+    """Raise InputError if a MetaImage has fewer packed bytes than declared: ITK returns what was in memory for them."""
+    n_bytes = 0
+    try:
+        for file in _data_files(path, header) or [path]:
+            inflater = zlib.decompressobj(32 + zlib.MAX_WBITS)  # of zlib or gzip
+            with file.open("rb") as stream:
+                stream.seek(header.n_bytes if file == path else int(header.skip))
+                while n_bytes < header.value_bytes and (block := stream.read(BLOCK_BYTES)):
+                    n_bytes += len(inflater.decompress(block))
+    except (ValueError, zlib.error) as error:  # ValueError: a place before the file's beginning
+        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
+    if n_bytes < header.value_bytes:
+        raise InputError(
+            f"{DAMAGED_FILE} (its header declares {header.value_bytes} bytes of voxels, but {n_bytes} are packed)"
+        )
 
 
 def data_files(path: Path) -> list[Path]:
