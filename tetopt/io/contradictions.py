@@ -27,10 +27,6 @@ META_FIELDS = (
     ("positions", ("Origin", "Offset", "Position")),
     ("directions", ("TransformMatrix", "Rotation", "Orientation")),
 )
-NRRD_EXCLUDES = (
-    ("space", "spacedimension"), ("spacedirections", "spacings"), ("spacedirections", "axismins"),
-    ("spacedirections", "axismaxs"), ("spacedirections", "units"),
-)  # fmt: skip
 SPACES_OF_ITK = (  # of NRRD: ITK turns their coordinates to LPS and takes all others as LPS
     "left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las",
 )  # fmt: skip
