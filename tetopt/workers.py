@@ -72,15 +72,13 @@ class Workers(NamedTuple):
         return f"{counted(self.slots(), 'task')} at a time, each of {counted(self.threads, 'thread')}"
 
 
-def check_workers(count: int | None, scheduler: str | None, extra: str) -> None:
+def check_workers(count: int | None, scheduler: str | None) -> None:
     """Raise InputError for what `workers` rejects; call it before images are read and anything is written.
 
-    A scheduler is contacted, for `CONNECT_SECONDS` at most. `extra` is tetopt's extra that installs dask.
+    A scheduler is contacted, for `CONNECT_SECONDS` at most.
     """
     if find_spec("distributed") is None:
-        raise InputError(
-            f"distributed is not installed, but dask needs it to run tasks; {install_hint(extra, 'distributed')}"
-        )
+        raise InputError(f"distributed is not installed, but dask needs it to run tasks; {install_hint('distributed')}")
     if scheduler is not None and count is not None:
         raise InputError("`workers`: expected none with `scheduler`, which has its own workers; start more of those")
     if scheduler is not None:

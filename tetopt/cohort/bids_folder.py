@@ -84,7 +84,7 @@ def _images(folder: Path, suffix: str, labels: Sequence[str]) -> list[Any]:
         from bids import BIDSLayout
         from bids.layout import BIDSLayoutIndexer, parse_file_entities
     except ImportError:
-        raise InputError(f"BIDS folders need pybids: {install_hint('cohort', 'pybids')}, or give a table") from None
+        raise InputError(f"BIDS folders need pybids: {install_hint('pybids')}, or give a table") from None
     *entities, word = suffix.split("_")
     kind = parse_file_entities(f"/sub-x/anat/sub-x_{suffix}.nii.gz")
     kind = {name: value for name, value in kind.items() if name not in PLACE_ENTITIES}

@@ -125,7 +125,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     InputError
         Options are invalid; `Problems` lists all problems of the subjects.
     """
-    check_workers(cohort.workers, cohort.scheduler, "cohort")
+    check_workers(cohort.workers, cohort.scheduler)
     suffix = checked_suffix(cohort.mesh_format)
     place = cohort.output
     if options.threads is not None and options.threads < 1:

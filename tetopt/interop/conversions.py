@@ -66,7 +66,7 @@ def library(name: str, caller: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = PACKAGES.get(name, name)
-        raise InputError(f"{caller}: {package} is not installed; {install_hint('test', package)}") from error
+        raise InputError(f"{caller}: {package} is not installed; {install_hint(package)}") from error
 
 
 # --- from others

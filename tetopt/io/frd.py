@@ -169,7 +169,7 @@ def _checked_bytes(path: Path) -> bytes:
     if not whole.rstrip().endswith(b"9999"):
         raise InputError(f"{path}: the file is truncated; is CalculiX still running, or did it abort?")
     if importlib.util.find_spec("pyvista_frd") is None:  # an extra: few have CalculiX
-        hint = install_hint("calculix", "pyvista-frd-reader")
+        hint = install_hint("pyvista-frd-reader")
         raise InputError(f"{path}: reading it needs pyvista-frd-reader; {hint}")
     return whole
 

@@ -20,7 +20,7 @@ def mni_path(contrast: Literal["t1", "gm", "wm"]) -> Path:
     name = f"datasets/data/mni_icbm152_{contrast}_tal_nlin_sym_09a_converted.nii.gz"
     path = Path(package.origin).parent / name if package is not None and package.origin else Path(name)
     if not path.is_file():
-        raise InputError(f"the MNI152 brain comes with nilearn: {install_hint('docs', 'nilearn')}, or give an image")
+        raise InputError(f"the MNI152 brain comes with nilearn: {install_hint('nilearn')}, or give an image")
     return path
 
 

@@ -42,7 +42,7 @@ def frame_of(path: str, volume: int | None) -> NDArray:
     with picture:
         n_frames = getattr(picture, "n_frames", 1)
         if volume is None and n_frames > 1 and picture.format == "TIFF":
-            hint = install_hint("tiff", "tifffile")
+            hint = install_hint("tifffile")
             raise InputError(f"it has {n_frames} pages; choose one by `volume`, or read stacks with tifffile: {hint}")
         (frame,) = volume_index((n_frames,), volume)
         picture.seek(frame)

@@ -129,9 +129,7 @@ def dicom_file(path: Path) -> Path | None:
 
 def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
     if importlib.util.find_spec("pydicom") is None:
-        raise InputError(
-            f"DICOM needs pydicom; {install_hint('dicom', 'pydicom', 'python-gdcm')}, or dcm2niix converts it"
-        )
+        raise InputError(f"DICOM needs pydicom; {install_hint('pydicom', 'python-gdcm')}, or dcm2niix converts it")
     size = None
     if path.is_dir():
         files = sorted(path.iterdir())
@@ -332,7 +330,7 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
         except NotImplementedError:
             is_known = False
         if not is_known:
-            hint = f"{install_hint('dicom', 'python-gdcm')}, or decompress it with gdcmconv or dcmdjpeg"
+            hint = f"{install_hint('python-gdcm')}, or decompress it with gdcmconv or dcmdjpeg"
             raise InputError(f"{file.name} is compressed as {syntax.name}, which cannot be decoded here; {hint}")
         n_bytes = max(len(tags[keyword].value) for keyword in VOXELS if keyword in tags)
         columns, rows = file.size

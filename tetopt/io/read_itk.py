@@ -73,7 +73,7 @@ def _metaimage_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.flo
 
 def _check_installed() -> None:
     if importlib.util.find_spec("SimpleITK") is None:
-        raise InputError(f"NRRD and MetaImage need SimpleITK; {install_hint('itk', 'SimpleITK')}")
+        raise InputError(f"NRRD and MetaImage need SimpleITK; {install_hint('SimpleITK')}")
 
 
 # In the child

@@ -348,7 +348,7 @@ def _values(series: Any) -> NDArray:
         values: NDArray = series.asarray()
     except Exception as error:  # tifffile raises any error, also for a missing codec
         if "imagecodecs" in str(error):
-            raise InputError(f"its compression needs imagecodecs; {install_hint('tiff', 'imagecodecs')}") from error
+            raise InputError(f"its compression needs imagecodecs; {install_hint('imagecodecs')}") from error
         raise InputError(f"truncated or damaged; copy it again (tifffile: {one_line(error)[:200]})") from error
     return values.astype(np.float32) if values.dtype == np.float16 else values
 

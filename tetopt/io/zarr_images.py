@@ -233,7 +233,7 @@ def _library() -> Any:
         import zarr
         import zarr.storage
     except ImportError as error:
-        raise InputError(f"Zarr folders need the zarr library; {install_hint('zarr', 'zarr')}") from error
+        raise InputError(f"Zarr folders need the zarr library; {install_hint('zarr')}") from error
     return zarr
 
 

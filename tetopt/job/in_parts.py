@@ -84,7 +84,7 @@ def read_in_parts(plan: Plan) -> Task | None:
         raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
     if job.worker_gb is not None and job.scheduler is not None:
         raise InputError("`worker_gb`: only for workers on this machine; those of `scheduler` have their own limits")
-    check_workers(job.workers, job.scheduler, "zarr")
+    check_workers(job.workers, job.scheduler)
     plan = plan._replace(job=changed(job, parts=job.parts or 1))
     left = VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
     source = _left_source(plan, left) if _is_left(plan) else read_source(job, job.label_names)

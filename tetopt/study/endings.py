@@ -20,7 +20,7 @@ def imported(package: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        hint = f"install it with: {install_hint('compare', package)}"
+        hint = f"install it with: {install_hint(package)}"
         is_absent = isinstance(error, ModuleNotFoundError) and error.name == package
         words = "not installed" if is_absent else f"cannot be imported ({error})"
         raise InputError(f"{package}: {words}; {hint}") from error

@@ -189,11 +189,11 @@ PIPELINES = {
     "pytetwild": Pipeline(
         "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
         pytetwild, is_random=True, packages=("pytetwild",),
-        hint=f"install it with: {install_hint('compare', 'pytetwild')}",
+        hint=f"install it with: {install_hint('pytetwild')}",
     ),
     "mmg": Pipeline(
         "Mmg", "peer", "a lattice labelled by multi-Otsu classes or given labels, coarsened by Mmg, which keeps labels",
-        mmg, packages=("mmgpy",), hint=f"install it with: {install_hint('compare', 'mmgpy')}",
+        mmg, packages=("mmgpy",), hint=f"install it with: {install_hint('mmgpy')}",
     ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
 }  # fmt: skip
