@@ -190,8 +190,7 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
                 return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))
             if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
                 return None
-            if (other := irregular(path)) is not None:
-                raise InputError(f"expected a regular file, got {other}; copy its content into a file")
+            check_beginning(path)
             if name.endswith(HEADED_SUFFIXES):
                 return header_sizes(path)
             _checked_head(path, name.endswith((".gz", ".mgz")))
