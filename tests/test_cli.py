@@ -27,6 +27,7 @@ import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
+from tetopt.engine.requirements import ERROR_RATE
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import agreed, sentences, tell, unmet
 from tetopt.job.events import listened
@@ -555,7 +556,7 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     every = groups_of_help(capsys, "mesh", "--help-all")
     assert {name: len(options) for name, options in every.items()} == {
-        "Options": 5, "Region and labels": 18, "Number and size of cells": 9, "Initial mesh": 4,
+        "Options": 5, "Region and labels": 18, "Number and size of cells": 10, "Initial mesh": 4,
         "Optimisation": 11, "Meshing in parts": 4, "For the solver": 14,
     }  # fmt: skip
     shown = groups_of_help(capsys, "mesh", "--help")
@@ -1015,7 +1016,7 @@ def test_target_error_with_the_most_nodes(tmp_path, capfd):
     )
     ((predicted, words),) = re.findall(pattern, err)
     assert (int(first), int(last), words) == (200, 230, "more than --nodes-max, so that the next run has 230 nodes")
-    assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / 0.7), rel=0.01)
+    assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE), rel=0.01)
     assert err.index(words) < err.index(f"{last} nodes leave")
     assert f"{reached} of the image's variance is unexplained, more than 0.001, which takes about " in err
     assert "allow more (--nodes-max)" in err

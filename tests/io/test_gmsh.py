@@ -265,7 +265,7 @@ def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
 
 
 @pytest.mark.parametrize(("n", "bins"), MODELS)
-def test_views_hold_cell_data_and_moduli_that_no_group_tells(n, bins):
+def test_views_hold_cell_data_and_materials(n, bins):
     model = sample_model(n, bins)
     several = np.random.default_rng(0).normal(size=(len(model.mesh.cells), 2))
     model = model._replace(cell_data={**model.cell_data, "contrast": several})

@@ -20,10 +20,10 @@ from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements
-from tetopt.model.sets import area_vectors
+from tetopt.model.sets import area_vectors, standard_names
 from tetopt.report.tables import new_table, nodes_in_words
 
-MOST_SETS = 20  # printed of facets, of cells, and of materials
+MOST_SETS = 32  # printed of facets, of cells, and of materials
 GMSH_SUFFIXES = (".msh", ".msh2")
 CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word for the number of a cell
 MOST_LABEL_LINES = 12  # about labels, of which a file may have hundreds
@@ -37,7 +37,8 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
         return
     size = "area, mm2" if model.mesh.ndim == 3 else "length, mm"
     table, cells, sets = new_table("set", "facets", size, "nodes", "cells"), elements(model)[1], model.sets
-    for name, rows in list(sets.facets.items())[:MOST_SETS]:
+    standard = standard_names(model.mesh.ndim)  # the user's sets first
+    for name, rows in sorted(sets.facets.items(), key=lambda item: item[0] in standard)[:MOST_SETS]:
         area = np.linalg.norm(area_vectors(model.mesh, rows), axis=1).sum()
         n_nodes = len(np.unique(element_facets(cells, rows)))
         table.add_row(escape(name), str(len(rows)), f"{area:.5g}", str(n_nodes), "")
@@ -86,7 +87,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         young, nu = materials.young, materials.nu
         ratios = f"{nu.min():.4g}" if nu.min() == nu.max() else f"{nu.min():.4g} to {nu.max():.4g}"
         count = f"{len(young)} material{'s' * (len(young) > 1)}"
-        yield f"{count}, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
+        moduli = f"{young.min():.4g}" if young.min() == young.max() else f"{young.min():.4g} to {young.max():.4g}"
+        yield f"{count}, Young's modulus {moduli} kPa, nu {ratios}"
         yield from _materials_by_name(model, materials)
     if materials is not None and model.gauss_young is not None:
         yield (

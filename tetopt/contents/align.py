@@ -340,16 +340,31 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
     )
 
 
-def filled_holes(labels: Image, label: int) -> tuple[Image, NDArray[np.int64]]:
-    """Give a label to the voxels of label 0 that no path through faces of such voxels connects to the box's sides.
+class FilledHoles(NamedTuple):
+    """Labels without holes, and the holes."""
 
-    Also return the number of voxels of each hole, the largest first.
-    """
-    empty, sizes = _pieces(labels.data == BACKGROUND_LABEL)
+    labels: Image
+    sizes: NDArray[np.int64]  # (H,) voxels of each
+    around: NDArray[np.int64]  # (H,) the label that most of its faces touch
+
+
+def filled_holes(labels: Image, label: int) -> FilledHoles:
+    """Give a label to the voxels of label 0 that no path through faces of such voxels connects to the box's sides."""
+    data = labels.data
+    empty, sizes = _pieces(data == BACKGROUND_LABEL)
     sizes[_on_faces(empty)] = 0
-    dtype = np.result_type(labels.data, np.min_scalar_type(label))
-    data = np.where(sizes[empty] > 0, np.array(label, dtype=dtype), labels.data)
-    return Image(data, labels.affine), np.sort(sizes[sizes > 0])[::-1]
+    is_hole = sizes > 0
+    touching = []
+    for axis in range(data.ndim):
+        for step in (-1, 1):
+            hole, beside = (np.roll(each, step * k, axis)[is_hole[empty]] for each, k in ((empty, 0), (data, 1)))
+            touching.append(np.column_stack([hole, beside]))
+    pairs, counts = np.unique(np.concatenate(touching), axis=0, return_counts=True)
+    pairs = pairs[np.lexsort([counts * (pairs[:, 1] != BACKGROUND_LABEL), pairs[:, 0]])]
+    around = pairs[np.flatnonzero(np.diff(pairs[:, 0], append=-1)), 1]  # the last row of each hole
+    dtype = np.result_type(data, np.min_scalar_type(label))
+    filled = np.where(is_hole[empty], np.array(label, dtype=dtype), data)
+    return FilledHoles(Image(filled, labels.affine), sizes[is_hole], around.astype(np.int64))
 
 
 def background_level(image: Image) -> float:

@@ -22,6 +22,7 @@ from tetopt.mesh import Mesh
 
 # The defaults of all entry points, with their evidence (docs/measured/sizes.md, docs/understand/k_d.md).
 DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; a graded mesh of a small image has fewer
+CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 TARGET_NODES_MAX = 50_000  # for a target error, by default
 UNIFORM_K_D = 0.2  # nearly all of the image's benefit for the displacement, at hardly any cost in shape
 UNIFORM_ITERATIONS = 20  # sweeps over all nodes, as in the paper's figures

@@ -25,6 +25,7 @@ from tetopt.contents.content import content as make_content
 from tetopt.engine.curving import curved
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
+    CUT_SHORT,
     DEFAULT_NODES,
     GRADED_ITERATIONS,
     GRADED_K_D,
@@ -90,7 +91,6 @@ QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension,
 NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
 FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
-CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 RATE_LIMITS = (0.3, 1.0)  # of a measured `ERROR_RATE`
 ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time

@@ -22,7 +22,7 @@ from tetopt.contents.memberships import Memberships, supersampling
 from tetopt.energy.discretization import unexplained
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.labelling import COMPONENT_VOXELS
-from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.loop import CUT_SHORT, IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box, manifold_problems
@@ -150,11 +150,13 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
     fraction = unexplained_by(content, result.mesh, result.history[-1])
     if target_error is not None and fraction > target_error:
         ratio = float(f"{nodes_ratio(fraction, target_error):.2g}")
-        violated["error"] = (
-            f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}, which takes about "
-            f"{ratio:g} times the nodes; allow more (`nodes_max`), smaller cells or more iterations, or raise "
-            "`target_error`"
+        rest = (
+            f"as the run was cut short ({result.ended}); allow more time or memory, or raise `target_error`"
+            if result.ended in CUT_SHORT
+            else f"which takes about {ratio:g} times the nodes; allow more (`nodes_max`), smaller cells or more "
+            "iterations, or raise `target_error`"
         )
+        violated["error"] = f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}, {rest}"
     violated |= _uncovered(content.image, result) if is_filled else {}
     if not is_filled and content.region is None and (problems := manifold_problems(result.mesh)):
         violated["manifold"] = "; ".join([*problems, "mend the initial mesh"])

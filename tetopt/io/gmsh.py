@@ -19,9 +19,9 @@ the mesh that two sets hold from opposite sides is oriented as in the first of t
 its elements.
 
 Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data, and "young" and
-"nu" of materials that are not groups, instead of cell data of these names. Facets have the values of the cell that they
-belong to, because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns are
-vectors, by which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
+"nu" of the materials instead of cell data of these names. Facets have the values of the cell that they belong to,
+because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns are vectors, by
+which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
 
 More than 1000 materials are only views, not groups; in 2.2 they are rejected.
 
@@ -159,7 +159,7 @@ def gmsh41(model: Model) -> bytes:
             f"{sum(counts.values())} {n_elements} 1 {n_elements}\n",
             *(_element_blocks(model, cells, part) for part in parts),
         ),
-        *_views(model._replace(materials=None) if grouped.materials is not None else model, parts),
+        *_views(model, parts),
     )
 
 

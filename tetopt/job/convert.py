@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tetopt.contents.align import SMALL_COMPONENT_FRACTION
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
+from tetopt.geometry.topology import components
 from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
+from tetopt.io.text import counted
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning
 from tetopt.job.inputs import check_part, listed, read_mesh, texts_of, voxels_of
@@ -32,10 +36,18 @@ from tetopt.job.model import (
 from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
-from tetopt.model.file import MATERIAL_FIELDS, MeshFile, with_labels, without_results
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, with_cells, without_results
 from tetopt.model.labels import kept_labels, labels_of
 from tetopt.model.model import Model
-from tetopt.model.sets import INTERFACE_PREFIX, Sets, box_of, box_text, merged_sets, standard_names
+from tetopt.model.sets import (
+    INTERFACE_PREFIX,
+    Sets,
+    box_of,
+    box_text,
+    label_set_names,
+    merged_sets,
+    standard_names,
+)
 from tetopt.report.summary import model_summary, versions
 
 
@@ -121,16 +133,40 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     if labels is None:
         raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
     kept = kept_labels(choice.keep_labels, choice.drop_labels, np.unique(labels).tolist(), loaded.label_table.names)
-    part = with_labels(loaded, labels, kept)
+    is_kept = _without_crumbs(loaded.mesh, labels, np.isin(labels, kept))
+    part = with_cells(loaded, labels, is_kept)
     left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
     more = f"; their interfaces are sets: {listed(left)}" if left else ""
     note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")
-    for name, rows in loaded.sets.facets.items():
-        count = len(part.sets.facets.get(name, ()))
-        if count < len(rows) and name not in standard_names(loaded.mesh.ndim) and not name.startswith(INTERFACE_PREFIX):
-            warning(f'set "{name}" keeps {count} of its {len(rows)} facets; the others are on labels left out')
-    inputs = loaded.table("inputs") | {"kept_labels": kept, "mask": None, "background": None}  # of all labels
+    present = np.unique(labels).tolist()
+    rebuilt = {*standard_names(loaded.mesh.ndim), *label_set_names(present, loaded.label_table.names).values()}
+    for what, before, after in zip(("facets", "cells"), loaded.sets, part.sets, strict=True):
+        for name, rows in before.items():
+            count = len(after.get(name, ()))
+            if count < len(rows) and name not in rebuilt and not name.startswith(INTERFACE_PREFIX):
+                warning(f'set "{name}" keeps {count} of its {len(rows)} {what}; the others are of labels left out')
+    inputs = loaded.table("inputs") | {"kept_labels": kept}
     return part._replace(field_data=part.field_data | {"inputs": np.array([json.dumps(inputs)])})
+
+
+def _without_crumbs(mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the cells that stay, (M,), without components that have little of any label; report these.
+
+    No load or support would hold them: they hung on cells that are left out.
+    """
+    cells, volumes = np.flatnonzero(is_kept), mesh.cell_volumes
+    number = components(mesh.cells[cells])
+    share = np.zeros(number.max() + 1)
+    for label in np.unique(labels[cells]):
+        is_of = labels[cells] == label
+        of_component = np.bincount(number[is_of], volumes[cells[is_of]], len(share))
+        share = np.maximum(share, of_component / of_component.sum())
+    crumbs = cells[share[number] < SMALL_COMPONENT_FRACTION]
+    if len(crumbs):
+        count, volume = int((share < SMALL_COMPONENT_FRACTION).sum()), float(volumes[crumbs].sum())
+        words = f"less than {SMALL_COMPONENT_FRACTION:.0%} of any label, are left out with them"
+        note(f"{counted(count, 'component')} ({counted(len(crumbs), 'cell')}, {volume:.4g} mm{mesh.ndim}), {words}")
+    return np.isin(np.arange(len(labels)), crumbs, invert=True) & is_kept
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:

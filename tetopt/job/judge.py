@@ -15,6 +15,7 @@ from tetopt.engine.requirements import ANGLE_ROUNDING
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
+from tetopt.job.events import warning
 from tetopt.job.inputs import check_part, label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
@@ -23,7 +24,7 @@ from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
 from tetopt.measure.measures import fidelity
 from tetopt.measure.quality import Quality, quality
 from tetopt.measure.requirements import judged
-from tetopt.model.file import MASK_TEXT, MeshFile
+from tetopt.model.file import MASK_TEXT, MeshFile, words_of_other_box
 from tetopt.report.summary import size_summary
 
 
@@ -145,7 +146,11 @@ def judge(
     if image is not None:
         source = _source(loaded, image, labels, part, label_names)
         first, is_registered = source.contrasts[0], part.registered
-        warn_of_other_image(loaded, mesh, image, first, is_registered=is_registered, is_exact=check)
+        is_other = warn_of_other_image(loaded, mesh, image, first, is_registered=is_registered, is_exact=check)
+        if not is_other and (words := words_of_other_box(loaded, first)):
+            warning(
+                f"{image}: the mesh is of another box of it, {words}; pass the run's `crop`, as measures depend on it"
+            )
         has_mask = part.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
@@ -176,6 +181,10 @@ def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart
         keep_labels=None if labels is None else _labels_kept(inputs),
         fill_holes=None if labels is None or not isinstance(filled, int) else str(filled),
     )  # fmt: skip
+    if labels is None and inputs.get("kept_labels") is not None:  # the file's mask is that of all labels
+        loaded = loaded._replace(
+            field_data={name: text for name, text in loaded.field_data.items() if name not in (MASK_TEXT, "inputs")}
+        )
     names = None if part.mask_label is None else names
     numbers = None if labels is None else _merged(inputs, labels, part)
     return read_source(options, names, numbers=numbers, loaded=loaded)

@@ -299,7 +299,7 @@ def check_early(
         if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
             raise InputError(
                 f'load: the facets of "{load.set_name}" lie between two cells, where no outside force can act '
-                f"({load.kind}); use a set on the boundary, mesh one side alone (`mask`), or move the set"
+                f"({load.kind}); use a set on the boundary, leave out one side (`drop_labels`), or move the set"
             )
     file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
 

@@ -201,12 +201,14 @@ def _without_holes(
         return labels, None
     assert labels is not None, "the plan requires labels"
     label = _label_of_holes(options.fill_holes, table)
-    filled, sizes = filled_holes(labels, label)
+    filled, sizes, around = filled_holes(labels, label)
     if len(sizes):
-        size = float(np.prod(labels.spacing))
-        largest = f", the largest {sizes[0] * size:.4g}" if len(sizes) > 1 else ""
-        words = f"{counted(len(sizes), 'hole')} of {sizes.sum() * size:.4g} mm{labels.ndim}{largest}"
+        volumes = sizes * float(np.prod(labels.spacing))
+        by_label = sorted(((float(volumes[around == each].sum()), each) for each in np.unique(around)), reverse=True)
+        words = f"{counted(len(sizes), 'hole')} of {volumes.sum():.4g} mm{labels.ndim}, the largest {volumes.max():.4g}"
         note(f"label 0: {words}, filled by {label_words(label, table.names)}")
+        parts = [f"{label_words(each, table.names)} {size:.4g} mm{labels.ndim}" for size, each in by_label]
+        note(f"labels around most of each hole: {listed(parts)}")
     else:
         warning("`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the box's sides")
     return filled, label
@@ -303,7 +305,7 @@ def _merged(
         if missing and not is_preset(options.merge):
             warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
-        note(f"merged labels: {listed([f'{n} into {label_words(new, merged.names)}' for new, n in sizes])}")
+        note(f"numbers of labels merged: {listed([f'{n} as {label_words(new, merged.names)}' for new, n in sizes])}")
         return merged.labels, LabelTable(merged.names, {}), merged.numbers
     present = np.unique(labels.data)
     numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}

@@ -305,6 +305,8 @@ class _ModelCells(NamedTuple):
 def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> NDArray[np.float64]:
     """Return the value of each cell, or one for all."""
     mapping: Any = parse_any_mapping(value, name) if isinstance(value, str) else value
+    if isinstance(mapping, dict):
+        raise InputError(f"{name}: expected a number, array, mapping or text, got a dict; use tetopt.ByLabel(dict)")
     if not callable(mapping) and not isinstance(mapping, ByLabel) and np.ndim(mapping) < 2:
         return np.asarray(mapping, dtype=np.float64)
     if isinstance(mapping, ByLabel):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -310,13 +310,13 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
     return None
 
 
-def with_labels(loaded: MeshFile, labels: NDArray[np.int64], kept: Sequence[int]) -> MeshFile:
-    """Return the mesh's file without the cells whose `labels` (M,) are not kept.
+def with_cells(loaded: MeshFile, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]) -> MeshFile:
+    """Return the mesh's file with a part of its cells, (M,), which have `labels`, (M,).
 
     Each interface of a label that stays with one that goes remains as a set of facets, with its name, as do parts of
     other sets.
     """
-    mesh, is_kept = loaded.mesh, np.isin(labels, kept)
+    mesh = loaded.mesh
     of_labels = label_sets(mesh, labels, loaded.label_table.names)
     named = {name for kind in of_labels for name in kind} | standard_names(mesh.ndim)
     facet_sets = {name: rows for name, rows in loaded.sets.facets.items() if name not in named} | of_labels.facets
@@ -340,7 +340,6 @@ def with_labels(loaded: MeshFile, labels: NDArray[np.int64], kept: Sequence[int]
         cell_data={name: rows[is_kept] for name, rows in loaded.cell_data.items()},
         point_data={name: rows[nodes] for name, rows in loaded.point_data.items()},
         sets=Sets(facets, {name: rows for name, rows in own.items() if len(rows)}),
-        field_data={name: text for name, text in loaded.field_data.items() if name != MASK_TEXT},  # of all labels
     )
 
 
