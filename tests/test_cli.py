@@ -1012,13 +1012,13 @@ def test_target_error_with_the_most_nodes(tmp_path, capfd):
     numbers, err = numbers_in(tmp_path / "a.json"), " ".join(capfd.readouterr().err.split())
     (first, left), (last, reached) = re.findall(r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err)
     pattern = (
-        r"an error of 0.001 takes about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
+        r"an error of 0.001 requires about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
     )
     ((predicted, words),) = re.findall(pattern, err)
     assert (int(first), int(last), words) == (200, 230, "more than --nodes-max, so that the next run has 230 nodes")
     assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE), rel=0.01)
     assert err.index(words) < err.index(f"{last} nodes leave")
-    assert f"{reached} of the image's variance is unexplained, more than 0.001, which takes about " in err
+    assert f"{reached} of the image's variance is unexplained, more than 0.001, which requires about " in err
     assert "allow more (--nodes-max)" in err
     options = numbers["options"]
     assert list(numbers["violated"]) == ["error"]
@@ -1035,7 +1035,7 @@ def test_target_error_with_the_most_nodes(tmp_path, capfd):
         ("--nodes-max 300 --spacing 9", "--nodes-max: needs --target-error"),
         ("--nodes-max 4 --target-error 0.2", "--nodes-max: expected 5 or more, got 4"),
         ("--nodes-max 8 --target-error 0.2", "--nodes-max: expected a whole number, 9 or more in 3-D, got 8"),
-        ("--nodes-max 60 --target-error 0.2 --edge-max 9", "--nodes-max: sizes take"),
+        ("--nodes-max 60 --target-error 0.2 --edge-max 9", "--nodes-max: sizes require about"),
     ],
 )
 def test_the_most_nodes_are_those_for_an_error(tmp_path, inputs, capfd, options, words):

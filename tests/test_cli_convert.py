@@ -593,7 +593,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
         ("a.inp", ["--fields", "mean"], "--fields: expected none, mean, all and a file .vtu, .vtk, .xdmf, .msh"),
         ("a.vtu", ["--fields", "some"], "--fields: expected none, mean, all"),
-        ("a.inp", ["--units", "psi"], "--units: expected kPa or MPa or Pa, got psi"),
+        ("a.inp", ["--units", "psi"], "--units: expected one of kPa, MPa, Pa, got psi"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
         ("a.stl", ["--order", "2"], "--order 2 is for .vtu, .vtk, "),

@@ -9,7 +9,8 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import plain
-from tetopt.engine.meshing import Aim, MeshSearch, sizes_of_order
+from tetopt.engine.meshing import Aim, MeshSearch, _next_nodes, sizes_of_order
+from tetopt.engine.requirements import ERROR_RATE
 from tetopt.geometry.quadratic import node_count, quadratic
 from tetopt.start.clip import lattice_within
 
@@ -185,11 +186,11 @@ def test_a_search_by_attempts():
         ({"target_error": 0.2, "nodes_max": 64, "order": 2}, "nodes_max: expected a whole number, 65 or more in 3-D"),
         (
             {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(edge_size=9.0)},
-            r"nodes_max: sizes take \d+ nodes or more, got 500; allow as many, or larger cells",
+            r"nodes_max: sizes require about \d+ nodes, got 500; allow as many, or larger cells",
         ),
         (
             {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(longest=9.0)},
-            r"nodes_max: sizes take \d+ nodes or more, got 500",
+            r"nodes_max: sizes require about \d+ nodes, got 500",
         ),
     ],
 )
@@ -214,3 +215,13 @@ def test_an_argument_of_another_name_is_named(arguments, words):
 def test_the_paper_takes_one_image():
     with pytest.raises(tetopt.InputError, match="one image, without labels or mask"):
         tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")
+
+
+def test_the_rate_of_an_image_is_that_of_its_runs():
+    """The error of this image falls with nodes^-0.4: two runs above the target tell the number that meets it."""
+    image, target = tetopt.Image(np.zeros((200, 200, 200))), 0.02
+    error = {n: 3.0 * n**-0.4 for n in (1500, 5000)}
+    aim = 0.925 * target
+    assert _next_nodes(image, error, target) == pytest.approx((3.0 / aim) ** (1.0 / 0.4), rel=1e-3)
+    first = 1500 * (error[1500] / aim) ** (1.0 / ERROR_RATE)
+    assert _next_nodes(image, {1500: error[1500]}, target) == pytest.approx(first, rel=1e-3)

@@ -352,6 +352,16 @@ def test_names_that_are_taken(version, kind):
         WRITERS[version](model)
 
 
+def test_moduli_by_label_are_read_back(tmp_path):
+    """Where groups are labels and materials at once; users of meshio find them as a view."""
+    sample = sample_model()
+    model = build_model(sample.mesh, young="1=10,*=2", cell_data={"label": sample.cell_data["label"]})
+    save_model(tmp_path / "a.msh", model)
+    back = load_mesh(tmp_path / "a.msh").cell_data
+    np.testing.assert_array_equal(back["young"], np.where(back["label"] == 1, 10.0, 2.0))
+    assert "young" in meshio.read(tmp_path / "a.msh").cell_data
+
+
 def test_a_set_and_cell_data_may_have_one_name(tmp_path):
     model = sample_model()
     save_model(tmp_path / "a.msh", model._replace(sets=model.sets._replace(cells={"mean": np.array([1])})))

@@ -136,5 +136,7 @@ def test_a_result_comes_with_its_mask_and_labels(place):
         tetopt.save_model(place / name, model if name == "a.vtu" else other)
     assert (place / "a.vtu").read_bytes() == (place / "b.vtu").read_bytes()
     assert not np.array_equal(model.cell_data["mean"], tetopt.cell_fields(result.mesh, image)["mean"])
+    straight = tetopt.mesh_image(image, 300, iterations=0, order=2)
+    assert (straight.mesh.midpoints, tetopt.build_model(straight).order) == (None, 2)
     with pytest.raises(InputError, match="a result of `mesh_image` without an image"):
         tetopt.build_model(result, image)

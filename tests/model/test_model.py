@@ -6,10 +6,11 @@ from models import sample_model
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
+from tetopt.mesh import Mesh
 from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
-from tetopt.model.model import described, in_space, in_units, mass_densities
-from tetopt.model.sets import facet_triples
+from tetopt.model.model import Model, described, in_space, in_units, mass_densities
+from tetopt.model.sets import Sets, facet_triples
 
 # Units and space
 
@@ -38,7 +39,7 @@ def test_units():
     assert described(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
     assert described(other)[2] == "units: mm, MPa, N, mJ, t, s"
     np.testing.assert_allclose(in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15)
-    with pytest.raises(InputError, match="expected kPa or MPa or Pa, got psi"):
+    with pytest.raises(InputError, match="expected one of kPa, MPa, Pa, got psi"):
         in_units(model, "psi")
 
 
@@ -68,6 +69,9 @@ def test_with_pascals_lengths_are_in_metres():
     assert found == pytest.approx(
         {"volume": 7e-9, "rho": 0.3, "stress_step2": 2000.0, "displacement": 0.005}, rel=1e-15
     )
+    corner = Mesh([[0, 0], [2, 0], [0, 2]], [[0, 1, 2]], [[1.0, 0.0], [0.0, 1.0], [1.1, 1.1]])
+    curved = in_units(Model(corner, {}, Sets({}, {}), order=2), "Pa").mesh
+    np.testing.assert_allclose(curved.midpoints, corner.midpoints / 1000.0, rtol=1e-15)
     back = in_units(other, "kPa")
     np.testing.assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-15)
     for one, two in zip(back.loads, model.loads, strict=True):

@@ -133,6 +133,8 @@ class MeshingResult(NamedTuple):
         Volume of the dropped components by label, mm^n; all of label 0 without labels.
     content : Content, optional
         What the mesh represents. Only from `mesh_image`.
+    order : {1, 2}
+        The order that was requested from `mesh_image`.
 
     Examples
     --------
@@ -158,6 +160,7 @@ class MeshingResult(NamedTuple):
     curving: Curving | None = None
     dropped: Mapping[int, float] = MappingProxyType({})
     content: Content | None = None
+    order: int = 1
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
         """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its labels, if any.

@@ -91,6 +91,7 @@ QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension,
 NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
 FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
+SIZES_MET = 0.9  # of the nodes of equilateral cells: targets are met down to these (docs/understand/sizes.md)
 RATE_LIMITS = (0.3, 1.0)  # of a measured `ERROR_RATE`
 ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
@@ -171,7 +172,7 @@ def mesh_image(
     ------
     InputError
         As for `optimize` or `optimize_paper`; options that do not apply to the mode; both of `nodes` and
-        `target_error`, or of `nodes` and `spacing`; `nodes_max` without `target_error`, or below what sizes take;
+        `target_error`, or of `nodes` and `spacing`; `nodes_max` without `target_error`, or below what sizes require;
         labels or a mask beside a content; a number of nodes that exceeds the image's detail (see `octree_mesh`) or the
         memory; or an error below the image's noise.
     TypeError
@@ -212,7 +213,7 @@ def mesh_image(
     search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
     for attempt in search:
         search.tell(attempt.run())
-    return search.result._replace(content=image)
+    return search.result._replace(content=image, order=order)
 
 
 class Aim(NamedTuple):
@@ -521,17 +522,19 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
     if none does, of the run with the least error, or of one that was cut short. It is the same as with that number of
     nodes from the start, unless limits on sizes forbid it. At least 2^(n + 2) nodes are tried, and at least as many as
-    targets of sizes take.
+    targets of sizes require.
 
     Raises
     ------
     InputError
-        As for `_check_reachable` and `octree_mesh`; or sizes take more than `nodes_max`.
+        As for `_check_reachable` and `octree_mesh`; or sizes require more than `nodes_max`.
     """
     target_error, nodes_max, sizes = aim.target_error or 0.0, aim.nodes_max or 0, aim.sizes
     _check_reachable(content, target_error)
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, predicted, ratio = FIRST_NODES[content.image.ndim], None, nodes_per_corner(content.image.ndim, aim.order)
+    if SIZES_MET * fewest <= nodes_max / ratio < fewest:
+        fewest = round(nodes_max / ratio)
     fractions = dict[int, float]()  # unexplained variance by number of nodes
     best: list[MeshingResult] = []  # the one so far: no more results are kept
     runs = EarlierRuns()
@@ -581,7 +584,7 @@ def _check_reachable(content: Content, target_error: float) -> None:
 
 
 def _beyond(nodes_max: int, needed: int) -> InputError:
-    return InputError(f"nodes_max: sizes take {needed} nodes or more, got {nodes_max}; allow as many, or larger cells")
+    return InputError(f"nodes_max: sizes require about {needed} nodes, got {nodes_max}; allow as many, or larger cells")
 
 
 def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:

@@ -153,7 +153,7 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
         rest = (
             f"as the run was cut short ({result.ended}); allow more time or memory, or raise `target_error`"
             if result.ended in CUT_SHORT
-            else f"which takes about {ratio:g} times the nodes; allow more (`nodes_max`), smaller cells or more "
+            else f"which requires about {ratio:g} times the nodes; allow more (`nodes_max`), smaller cells or more "
             "iterations, or raise `target_error`"
         )
         violated["error"] = f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}, {rest}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -424,6 +425,10 @@ def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart, masks: Masks) -
         raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)
     texts = {TABLE_TEXT: np.array([table_words(own)])} if own.names else {}
+    inputs = {
+        name: each for name, each in loaded.table("inputs").items() if name not in ("kept_labels", "filled_holes")
+    }
+    texts |= {"inputs": np.array([json.dumps(inputs)])} if inputs else {}  # of the labels that these replace
     return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts}), counted
 
 

@@ -178,7 +178,6 @@ def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
-        keep_labels=None if labels is None else _labels_kept(inputs),
         fill_holes=None if labels is None or not isinstance(filled, int) else str(filled),
     )  # fmt: skip
     if labels is None and inputs.get("kept_labels") is not None:  # the file's mask is that of all labels
@@ -187,13 +186,13 @@ def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart
         )
     names = None if part.mask_label is None else names
     numbers = None if labels is None else _merged(inputs, labels, part)
-    return read_source(options, names, numbers=numbers, loaded=loaded)
+    return read_source(options, names, numbers=numbers, loaded=loaded, kept=None if labels is None else _kept(inputs))
 
 
-def _labels_kept(inputs: Mapping[str, Any]) -> str | None:
+def _kept(inputs: Mapping[str, Any]) -> list[int] | None:
     """Return the labels that the mesh's run kept, if it left out others."""
     kept = inputs.get("kept_labels")
-    return ",".join(map(str, kept)) if isinstance(kept, list) and kept else None
+    return [each for each in kept if isinstance(each, int)] if isinstance(kept, list) and kept else None
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:

@@ -207,7 +207,7 @@ def _say_predicted(task: Task, last: MeshingResult, corners: int, n_bytes: float
     job, n_corners = task.plan.job, len(last.mesh.points)
     nodes = round(corners * node_count(last.mesh.points, last.mesh.cells, task.plan.order) / n_corners)
     seconds = last.history[-1].seconds * (corners / n_corners) ** TIME_RATE
-    words = f"an error of {job.target_error:g} takes about {nodes} nodes, {time_words(seconds)} and "
+    words = f"an error of {job.target_error:g} requires about {nodes} nodes, {time_words(seconds)} and "
     words += f"{memory_words(n_bytes)} of memory"
     if nodes > (most := job.nodes_max or nodes):
         words += f"; more than `nodes_max`, so that the next run has {most} nodes"

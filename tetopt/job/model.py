@@ -73,7 +73,7 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     if solver.average is not None and solver.young is None:
         raise InputError("`average`: needs `young`")
     if solver.units not in STRESS_UNITS:
-        raise InputError(f"`units`: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
+        raise InputError(f"`units`: expected one of {', '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.fields is not None and (solver.fields not in FIELDS or not form.fields):
         able = ", ".join(name for name, kind in FORMATS.items() if kind.fields)
         raise InputError(f"`fields`: expected {', '.join(FIELDS)} and a file {able}, got {solver.fields} for {output}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,12 +128,13 @@ class Source(NamedTuple):
 
 def read_source(
     options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None,
-    loaded: MeshFile | None = None,
+    loaded: MeshFile | None = None, kept: Sequence[int] | None = None,
 ) -> Source:  # fmt: skip
     """Read images, labels with their names, and mask, on the voxels of the first image.
 
-    Labels get other `numbers` if given; otherwise they are merged by the options and their names. Without a mask or a
-    background in the options, that of a mesh's file counts, if one was `loaded`.
+    Labels get other `numbers` if given; otherwise they are merged by the options and their names. Only the labels in
+    `kept` stay, if given; otherwise the options choose. Without a mask or a background in the options, that of a mesh's
+    file counts, if one was `loaded`.
     """
     paths = options.images
     finest: Originals = read_mask(options, label_names)
@@ -143,7 +144,7 @@ def read_source(
     image, beside, factors = image_and_others(read_image(paths[0], options), paths[0], options, finest)
     labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
     labels, filled = _without_holes(options, labels, table)
-    if labels is not None and is_own and (numbers or filled is not None):
+    if labels is not None and is_own and (numbers or (filled is not None and options.tissues is None)):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     level = None
@@ -153,7 +154,7 @@ def read_source(
         is_auto = options.background == "auto"
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = _foreground(image, level, labels)
-    labels, mask, kept = _chosen(options, labels, mask, table)
+    labels, mask, kept = _chosen(options, labels, mask, table, kept)
     balance = balance_of(options)
     if options.weights is None and is_own:
         whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
@@ -211,7 +212,7 @@ def _without_holes(
         note(f"labels around most of each hole: {listed(parts)}")
     else:
         warning("`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the box's sides")
-    return filled, label
+    return filled, label if len(sizes) else None
 
 
 def _label_of_holes(text: str, table: LabelTable) -> int:
@@ -226,17 +227,18 @@ def _label_of_holes(text: str, table: LabelTable) -> int:
 
 
 def _chosen(
-    options: SourceOptions, labels: Image | None, mask: Image | None, table: LabelTable
-) -> tuple[Image | None, Image | None, list[int] | None]:  # fmt: skip
+    options: SourceOptions, labels: Image | None, mask: Image | None, table: LabelTable, kept: Sequence[int] | None
+) -> tuple[Image | None, Image | None, Sequence[int] | None]:  # fmt: skip
     """Return the labels that stay and the mask of their voxels, within another mask; and their numbers, if chosen."""
-    if options.keep_labels is None and options.drop_labels is None:
+    if kept is None and options.keep_labels is None and options.drop_labels is None:
         return labels, mask, None
     assert labels is not None, "the plan requires labels"
-    present = np.unique(labels.data).astype(np.int64).tolist()
-    kept = kept_labels(options.keep_labels, options.drop_labels, present, table.names)
+    if kept is None:
+        present = np.unique(labels.data).astype(np.int64).tolist()
+        kept = kept_labels(options.keep_labels, options.drop_labels, present, table.names)
     is_kept = np.isin(labels.data, kept)
     if not (is_kept if mask is None else is_kept & (mask.data >= INSIDE_FRACTION)).any():
-        raise InputError("`keep_labels`, `drop_labels`: no voxel would be left within the mask")
+        raise InputError(f"labels that stay, {listed(kept)}: no voxel within the mask has one of them")
     mask = Image(is_kept if mask is None else np.where(is_kept, mask.data, 0.0), labels.affine)
     # Those left out on purpose are not reported as missing.
     return Image(np.where(is_kept, labels.data, BACKGROUND_LABEL), labels.affine), mask, kept

@@ -64,9 +64,9 @@ def build_model(
     ----------
     mesh : Mesh, MeshFile or MeshingResult
         A result of `mesh_image` comes with the image, mask and labels that it was made from. The contents of a file
-        (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and
-        nodes, labels and their names, sets, moduli, loads, the image's box, and strings on its origin. Solver results
-        are kept if moduli and loads are.
+        (`tetopt.load_mesh`) go into the model unless arguments replace them: data of cells and nodes, labels and their
+        names, sets, moduli, loads, the image's box, and strings on its origin. Solver results are kept if moduli and
+        loads are.
     image : Image or Content, optional
         Mappings are applied to its intensities, and the faces of its box become sets. For a mesh of a content, pass the
         content: its first contrast counts, and no voxel outside its mask. A MeshFile knows its mask; a MeshingResult
@@ -93,8 +93,8 @@ def build_model(
     spacing : {"equal", "quantile", "log"}
         The spacing of the bins.
     order : {1, 2}, optional
-        By default the file's, or 1. 2: quadratic cells where a file format has them, with straight edges unless the
-        mesh has midpoints; `mesh_image` with order 2 creates these on interfaces and on a mask's surface.
+        By default the file's or the result's, or 1. 2: quadratic cells where a file format has them, with straight
+        edges unless the mesh has midpoints; `mesh_image` with order 2 creates these on interfaces and a mask's surface.
     cell_data : dict, optional
         Data of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields` and the data of the
         file.
@@ -189,7 +189,7 @@ def build_model(
 def _of_result(
     result: MeshingResult, image: Image | Content | None, order: int | None, cell_data: dict[str, NDArray] | None
 ) -> tuple[Mesh, Content, int | None, dict[str, NDArray]]:
-    """Return a result's mesh, content, order, if its edges are curved, and data of cells, unless given."""
+    """Return a result's mesh and content, and its order and data of cells, unless given."""
     mesh, content = result.mesh, result.content
     if image is not None or content is None:
         raise InputError(
@@ -199,7 +199,7 @@ def _of_result(
     if cell_data is None:
         labels = {} if result.labels is None else {"label": result.labels}
         cell_data = cell_fields(mesh, content) | labels
-    return mesh, content, 2 if order is None and mesh.midpoints is not None else order, cell_data
+    return mesh, content, result.order if order is None else order, cell_data
 
 
 def _voxels(

@@ -239,7 +239,7 @@ def in_units(model: Model, units: str) -> Model:
         The unit is unknown.
     """
     if units not in STRESS_UNITS:
-        raise InputError(f"units: expected {' or '.join(STRESS_UNITS)}, got {units}")
+        raise InputError(f"units: expected one of {', '.join(STRESS_UNITS)}, got {units}")
     if units == model.units:
         return model
     old, new, mesh, table = STRESS_UNITS[model.units], STRESS_UNITS[units], model.mesh, model.materials
