@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 import tetopt
 from tetopt.io.mni import mni_path
 from tetopt.measure.segmentation import thresholded
+from tetopt.study import tetwild
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.files import checked_output, save_json
 
@@ -74,7 +75,7 @@ def same_error(path: Path, cgal: str) -> dict[str, Any]:
 def _at_error(mesher: Mesher, error_of: Callable[[tetopt.Mesh], float], goal: float) -> dict[str, Any]:
     """Return the run with the fewest nodes whose error is at most the goal, by secants of log error over log nodes."""
     runs: list[tuple[int, float, float]] = []
-    request, slope = float(NODES), -0.6
+    request, slope = 3.0 * NODES, -0.6
     for _ in range(MOST_RUNS):
         mesh, seconds = mesher(request)
         runs.append((len(mesh.points), seconds, error_of(mesh)))
@@ -86,12 +87,15 @@ def _at_error(mesher: Mesher, error_of: Callable[[tetopt.Mesh], float], goal: fl
             slope = float(np.clip(np.log(e / f) / np.log(n / m), -1.5, -0.2)) if n != m else slope
         near = min(runs, key=lambda run: abs(np.log(run[2] / goal)))
         aim = (1.0 - ERROR_TOLERANCE / 2) * goal
-        request = near[0] * float(np.clip((aim / near[2]) ** (1.0 / slope), 0.25, 4.0))
+        request *= float(np.clip((aim / near[2]) ** (1.0 / slope) * near[0] / runs[-1][0], 0.25, 4.0))
     fewest = min((run for run in runs if run[2] <= goal), default=min(runs, key=lambda run: run[2]))
     return {"nodes": fewest[0], "seconds": fewest[1], "error": fewest[2], "runs": runs}
 
 
 def _pytetwild(image: tetopt.Image) -> Mesher:
+    """Return pytetwild as a mesher of the image's classes, in one run: the number of nodes need not be met."""
+    tetwild.TETWILD_RUNS = 1
+
     def mesher(nodes: float) -> tuple[tetopt.Mesh, float]:
         produced = PIPELINES["pytetwild"].function(PipelineInput(image, None, round(nodes)))
         return produced.mesh, sum(each for step, each in produced.seconds.items() if step != "search")
