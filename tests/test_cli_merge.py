@@ -39,9 +39,9 @@ def refused(capsys, *arguments):
 def test_groups_reach_every_file(folder, capsys):
     merge = "white=2,41,16,85; grey=3,42; fluid=24; 7:rest=*"
     assert exit_code(*words(folder, "--merge", merge)) == 0
-    assert "merged labels: 1 into 0, 4 into 1 (white), 2 into 2 (grey), 1 into 3 (fluid), 3 into 7 (rest)" in (
-        capsys.readouterr().err
-    )
+    told = " ".join(capsys.readouterr().err.split())
+    assert "merged: 1 label into 0, 4 labels into 1 (white), 2 labels into 2 (grey), 1 label into 3 (fluid)" in told
+    assert "3 labels into 7 (rest)" in told
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert set(loaded.cell_data["label"]) == {0, 1, 2, 3, 7}
     assert loaded.label_table.names == {1: "white", 2: "grey", 3: "fluid", 7: "rest"}
@@ -104,7 +104,7 @@ def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
     labels = tetopt.load_image(folder / "l.nii.gz")
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(np.where(labels.data > 500, 511, labels.data)))
     assert exit_code(*words(folder, "--merge", "synthseg")) == 0
-    assert "1 into 5 (soft)" in (said := capsys.readouterr().err)
+    assert "1 label into 5 (soft)" in (said := capsys.readouterr().err)
     assert "has no label for" not in said
 
 

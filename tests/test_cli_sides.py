@@ -198,7 +198,9 @@ def test_enclosed_air_gets_a_label(skull, capsys, word, label):
     of_cell, volume = loaded.cell_data["label"], loaded.mesh.cell_volumes
     assert set(np.unique(of_cell)) - {0} == {WALL, BLOOD, label} - ({WALL} - set(np.unique(of_cell)))
     if label == 300:
-        assert loaded.cell_data["mean"][of_cell == 300].min() > 250.0  # the image, of labels alone, is filled, too
+        assert (
+            np.median(loaded.cell_data["mean"][of_cell == 300]) == 300.0
+        )  # the image, of labels alone, is filled, too
         assert volume[of_cell == 300].sum() == pytest.approx(2 * sum(sizes), rel=0.1)
     bone = 2 * ((labels == BLOOD).sum() + (sum(sizes) if label == BLOOD else 0))
     assert volume[of_cell == BLOOD].sum() == pytest.approx(bone, rel=0.02)

@@ -307,7 +307,8 @@ def _merged(
         if missing and not is_preset(options.merge):
             warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
-        note(f"numbers of labels merged: {listed([f'{n} as {label_words(new, merged.names)}' for new, n in sizes])}")
+        parts = [f"{counted(n, 'label')} into {label_words(new, merged.names)}" for new, n in sizes]
+        note(f"merged: {listed(parts)}")
         return merged.labels, LabelTable(merged.names, {}), merged.numbers
     present = np.unique(labels.data)
     numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}
