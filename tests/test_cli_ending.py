@@ -258,20 +258,6 @@ def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path,
     assert tetopt.load_mesh(kept).cell_data["mean"].max() > 0.0
 
 
-def test_an_output_that_came_meanwhile_stays(image, folder, monkeypatch, capsys):
-    save = tetopt.job.write.save_for_solver
-
-    def raced(*arguments):
-        (folder / "a.vtu").write_text("theirs")
-        save(*arguments)
-
-    monkeypatch.setattr(tetopt.job.write, "save_for_solver", raced)
-    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert (folder / "a.vtu").read_text() == "theirs"
-    assert f"is in {folder / 'a_optimised_1.vtu'}" in capsys.readouterr().err
-    assert len(tetopt.load_mesh(folder / "a_optimised_1.vtu").mesh.cells) > 100
-
-
 def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, capsys):
     def full(*_):
         raise OSError(28, "No space left on device", str(folder / "a.json"))

@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
-    settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),))
+    settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),), average="mean")
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
