@@ -13,13 +13,12 @@ import argparse
 import json
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark import HEAD_NODES, head_command, process_seconds, sized_head, written_labels
+from benchmark import HEAD_NODES, cgal_command, head_command, process_seconds, sized_head
 from numpy.typing import NDArray
 
 import tetopt
@@ -106,19 +105,11 @@ def _pytetwild(image: tetopt.Image) -> Mesher:
 def _cgal(program: str, image: tetopt.Image, folder: Path) -> Mesher:
     """Return CGAL as a mesher of the image's classes, with one cell size."""
     labels = thresholded(image, 4)
-    raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")  # CGAL leaves out label 0
-    grid = written_labels(folder / "labels.raw", raised, labels)
 
     def mesher(nodes: float) -> tuple[tetopt.Mesh, float]:
-        size, out = 1.8 * (labels.volume / nodes) ** (1 / 3), folder / "mesh.bin"
-        for _ in range(5):
-            command = [program, str(folder / "labels.raw"), *grid, str(out), str(size)]
-            seconds = min(process_seconds(command)[0] for _ in range(2))  # as of tetopt
-            mesh, _ = mesh_of(out, labels)
-            if abs(len(mesh.points) / nodes - 1.0) < 0.03:
-                break
-            size *= (len(mesh.points) / nodes) ** (1 / 2.2)
-        return mesh, seconds
+        command, _ = cgal_command(program, labels, round(nodes), folder)
+        seconds = min(process_seconds(command)[0] for _ in range(2))  # as of tetopt
+        return mesh_of(folder / "mesh.bin", labels)[0], seconds
 
     return mesher
 
@@ -143,16 +134,13 @@ def same_dice(path: Path, cgal: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command, _ = sized_head(cgal, labels, HEAD_NODES, folder)
-        begin = time.perf_counter()
-        process_seconds(command)
-        seconds = time.perf_counter() - begin
+        seconds, _ = process_seconds(command)
         mesh, of_cell = mesh_of(folder / "mesh.bin", labels)
         rows: dict[str, Any] = {"counts": HEAD_COUNTS, "cgal": {"nodes": len(mesh.points), "seconds": seconds}}
         rows["cgal"]["dice"] = dice = _dice(labels, mesh, of_cell)
         for nodes in HEAD_COUNTS:
-            begin = time.perf_counter()
-            process_seconds(head_command(path, folder, nodes), allowed=(0, 1))
-            ours = {"nodes": nodes, "seconds": time.perf_counter() - begin}
+            seconds, _ = process_seconds(head_command(path, folder, nodes), allowed=(0, 1))
+            ours: dict[str, Any] = {"nodes": nodes, "seconds": seconds}
             loaded = tetopt.load_mesh(folder / "out.vtu")
             ours["dice"] = _dice(labels, loaded.mesh, loaded.cell_data["label"].astype(np.int64))
             rows["tetopt"] = ours

@@ -132,7 +132,7 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
         if cgal is None:
             rows["cgal"] = "no program given (--cgal)"
         else:
-            commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
+            commands["cgal"], rows["cgal_nodes"] = cgal_command(cgal, labels, nodes, folder)
         seconds: dict[str, list[tuple[float, float]]] = {}
         for turn in range(turns):
             for name, command in commands.items():
@@ -148,7 +148,7 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
     return rows
 
 
-def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
+def cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
     """Return `_sized` for the program with one cell size."""
     # CGAL skips label 0, so all labels are raised by one. Padding by a voxel keeps the outer labels whole.
     raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")

@@ -354,16 +354,14 @@ def filled_holes(labels: Image, label: int) -> FilledHoles:
     empty, sizes = _pieces(data == BACKGROUND_LABEL)
     sizes[_on_faces(empty)] = 0
     is_hole = sizes > 0
-    touching = []
-    for axis in range(data.ndim):
-        for step in (-1, 1):
-            hole, beside = (np.roll(each, step * k, axis)[is_hole[empty]] for each, k in ((empty, 0), (data, 1)))
-            touching.append(np.column_stack([hole, beside]))
+    is_inside = is_hole[empty]  # never at the box's sides, across which voxels would be rolled
+    beside = [np.roll(data, step, axis)[is_inside] for axis in range(data.ndim) for step in (-1, 1)]
+    touching = [np.column_stack([empty[is_inside], labels_there]) for labels_there in beside]
     pairs, counts = np.unique(np.concatenate(touching), axis=0, return_counts=True)
     pairs = pairs[np.lexsort([counts * (pairs[:, 1] != BACKGROUND_LABEL), pairs[:, 0]])]
     around = pairs[np.flatnonzero(np.diff(pairs[:, 0], append=-1)), 1]  # the last row of each hole
     dtype = np.result_type(data, np.min_scalar_type(label))
-    filled = np.where(is_hole[empty], np.array(label, dtype=dtype), data)
+    filled = np.where(is_inside, np.array(label, dtype=dtype), data)
     return FilledHoles(Image(filled, labels.affine), sizes[is_hole], around.astype(np.int64))
 
 

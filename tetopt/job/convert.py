@@ -132,14 +132,14 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     labels = labels_of(loaded.cell_data, len(loaded.mesh.cells))
     if labels is None:
         raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
-    kept = kept_labels(choice.keep_labels, choice.drop_labels, np.unique(labels).tolist(), loaded.label_table.names)
+    present, names = np.unique(labels).tolist(), loaded.label_table.names
+    kept = kept_labels(choice.keep_labels, choice.drop_labels, present, names)
     is_kept = _without_crumbs(loaded.mesh, labels, np.isin(labels, kept))
     part = with_cells(loaded, labels, is_kept)
     left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
     more = f"; their interfaces are sets: {listed(left)}" if left else ""
     note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")
-    present = np.unique(labels).tolist()
-    rebuilt = {*standard_names(loaded.mesh.ndim), *label_set_names(present, loaded.label_table.names).values()}
+    rebuilt = {*standard_names(loaded.mesh.ndim), *label_set_names(present, names).values()}
     for what, before, after in zip(("facets", "cells"), loaded.sets, part.sets, strict=True):
         for name, rows in before.items():
             count = len(after.get(name, ()))
@@ -166,7 +166,9 @@ def _without_crumbs(mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.b
         count, volume = int((share < SMALL_COMPONENT_FRACTION).sum()), float(volumes[crumbs].sum())
         words = f"less than {SMALL_COMPONENT_FRACTION:.0%} of any label, are left out with them"
         note(f"{counted(count, 'component')} ({counted(len(crumbs), 'cell')}, {volume:.4g} mm{mesh.ndim}), {words}")
-    return np.isin(np.arange(len(labels)), crumbs, invert=True) & is_kept
+    is_kept = is_kept.copy()
+    is_kept[crumbs] = False
+    return is_kept
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
