@@ -302,7 +302,7 @@ def test_compilers_run_no_modules_of_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     words = []
-    kernels._compile_apart(kernels.ALL_KERNELS[:1], tmp_path, words.append)
+    kernels._compile_apart(kernels.ALL_KERNELS[:1], 0, tmp_path, words.append)
     assert words[0].endswith("of 1")
     assert not (tmp_path / "executed").exists()
 

@@ -309,7 +309,7 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
             with _only_compiler(place.folder, say) as has_waited:
                 if has_waited:
                     n_ready = _n_kept(order, n_ready + 1)
-                _compile_apart(order[n_ready + 1 :], place.folder, say)
+                _compile_apart(order, n_ready + 1, place.folder, say)
     for number, kernel in enumerate(order):
         kernel.link()
         if not kernel.was_cached and number > n_ready:
@@ -357,8 +357,9 @@ def _callees_first(kernel: Any) -> Iterator[Any]:
     yield kernel
 
 
-def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], None]) -> None:
-    """Compile kernels into the cache, in one process per core and at most `MOST_COMPILING`."""
+def _compile_apart(order: Sequence[Any], first: int, folder: Path, say: Callable[[str], None]) -> None:
+    """Compile kernels from the `first` into the cache, in one process per core and at most `MOST_COMPILING`."""
+    kernels = order[first:]
     n_processes = min(MOST_COMPILING, os.cpu_count() or 1)
     if n_processes < 2 or not kernels or not sys.executable:
         return
@@ -379,7 +380,7 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
         command, environment = python_command("-c", code), python_environment()
         processes = [stack.enter_context(started(command, environment)) for _ in range(n_processes)]
         while any(process.poll() is None for process in processes):
-            say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")
+            say(f"compiling the kernels, {first + len(os.listdir(claims))} of {len(order)}")
             time.sleep(POLLED_SECONDS)
 
 
