@@ -560,32 +560,25 @@ class _Filling(NamedTuple):
 
 @unit
 def _fill_prefix(work: _Filling, i: int) -> None:
-    if work.is_single:
-        _fill_plane(work.volume, work.single, work.shift, i)
+    if work.volume.is_short:
+        _fill_rows(work.volume.short, work, i)
     else:
-        _fill_plane(work.volume, work.data, work.shift, i)
+        _fill_rows(work.volume.long, work, i)
 
 
 @helper
-def _fill_plane(volume: Volume, data: NDArray, shift: float, i: int) -> None:
-    if volume.is_short:
-        _fill_rows(volume.short, data, shift, i)
-    else:
-        _fill_rows(volume.long, data, shift, i)
-
-
-@helper
-def _fill_rows(prefix: NDArray, volume: NDArray, shift: float, i: int) -> None:
-    for j in range(volume.shape[1]):
+def _fill_rows(prefix: NDArray, work: _Filling, i: int) -> None:
+    n_k = prefix.shape[2] - 1
+    for j in range(prefix.shape[1]):
         first, second = 0.0, 0.0
-        for k in range(volume.shape[2]):
+        for k in range(n_k):
             prefix[i, j, k, 0] = first
             prefix[i, j, k, 1] = second
-            h = float(volume[i, j, k]) - shift
+            h = (float(work.single[i, j, k]) if work.is_single else work.data[i, j, k]) - work.shift
             first += h
             second += h * h
-        prefix[i, j, volume.shape[2], 0] = first
-        prefix[i, j, volume.shape[2], 1] = second
+        prefix[i, j, n_k, 0] = first
+        prefix[i, j, n_k, 1] = second
 
 
 @njit(cache=True)
