@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
 from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels, warn_of_absent
-from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
+from tetopt.contents.memberships import Memberships, finer, memberships, memberships_of, numbered, supersampling
 from tetopt.contents.noise import noise_level
 from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
@@ -39,7 +39,7 @@ class Continuation(NamedTuple):
 
     part: tuple[slice, ...]  # the voxels around the mask
     inside: NDArray[np.bool_]  # those that lie in it
-    nearest: NDArray[np.int64]  # (K,) flat index of the nearest voxel inside, for each one outside in C order
+    nearest: NDArray[np.integer]  # (K,) flat index of the nearest voxel inside, for each one outside in C order
 
 
 class Spread(NamedTuple):
@@ -303,24 +303,24 @@ def content(
         images = [continued(image, beyond) for image in images]
         if labels is not None:
             warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
-            labels = continued(labels, beyond)
+            labels = images[0] if labels is whole else continued(labels, beyond)
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
         raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
     if len(images) == 1 and labels is None and weights[0] > 0.0:
         result = Content(images[0], region=region, continuation=beyond, keeps_components=keep_components, whole=whole)
         return result if region is None else result._replace(squared_spread=result.variance)
-    members, rows, n_rows = None, np.empty(0, dtype=np.int32), 0
-    if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
-        factors = supersampling(labels.spacing)
-        members = memberships(labels, factors)
-        if max(factors) > 1:
-            images = [finer(image, factors) for image in images]
-            region = None if region is None else _finer_region(region, labels, factors)
-        rows, n_rows = members.partition, len(members.labels)
-    elif labels is not None and label_weight > 0.0:
-        present = np.unique(labels.data)
-        rows, n_rows = np.searchsorted(present, labels.data).astype(np.int32), len(present)
+    members, n_rows = None, 0
+    rows: NDArray[np.integer] = np.empty(0, dtype=np.int16)
+    if labels is not None and label_weight > 0.0:
+        factors, (present, rows) = supersampling(labels.spacing), numbered(labels)
+        labels, n_rows = None, len(present)  # its memory is needed
+        if smooth_interfaces > 0.0:
+            members = memberships_of(present, rows, factors)
+            rows = members.partition
+            if max(factors) > 1:
+                images = [finer(image, factors) for image in images]
+                region = None if region is None else _finer_region(region, factors)
     contrasts = _scaled(images, weights, region)
     codes = np.zeros((0, 1))
     if n_rows > 0:
@@ -343,12 +343,12 @@ def content(
     )
 
 
-def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Region:
+def _finer_region(region: Region, factors: Sequence[int]) -> Region:
     """The region on divided voxels, with its surface interpolated between slices like labels."""
     if region.inside.all():
-        inside = np.ones([n * factor for n, factor in zip(labels.shape, factors, strict=True)], dtype=bool)
+        inside = np.ones([n * factor for n, factor in zip(region.inside.shape, factors, strict=True)], dtype=bool)
         return Region(inside, np.full(inside.shape, region.level.min(), dtype=np.float32))
-    sides = memberships(Image(region.inside.astype(np.float64), labels.affine), factors)
+    sides = memberships(Image(region.inside), factors)
     outside, within = sides.levels[sides.channel]
     return Region(sides.partition == 1, (0.5 * (within - outside)).astype(np.float32))
 
@@ -357,9 +357,11 @@ def _scaled(images: list[Image], weights: list[float], region: Region | None) ->
     """The contrasts of weight above 0, minus their means and scaled to variance `weight`."""
     scaled = []
     for image, weight in zip(images, weights, strict=True):
+        if weight == 0.0:
+            continue
         data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
         spread = _variance(data, region)
-        if weight > 0.0 and spread > 0.0:
+        if spread > 0.0:
             scaled.append((np.sqrt(weight / spread) * data).astype(np.float32))
     return scaled
 
@@ -423,7 +425,12 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     if inside.all():
         return Continuation(part, inside, np.empty(0, dtype=np.int64))
     nearest = scipy.ndimage.distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
-    return Continuation(part, inside, np.ravel_multi_index(tuple(nearest[:, ~inside]), inside.shape))
+    outside = ~inside
+    flat = np.zeros(np.count_nonzero(outside), dtype=np.int32 if inside.size < 2**31 else np.int64)
+    for n, place in zip(inside.shape, nearest, strict=True):
+        flat *= n
+        flat += place[outside]
+    return Continuation(part, inside, flat)
 
 
 def continued(image: Image, mask: Image | Continuation | None) -> Image:
@@ -486,8 +493,8 @@ def _check(
 
 
 def _one_hot(
-    rows: NDArray[np.int32], n_rows: int, region: Region | None
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:  # fmt: skip
+    rows: NDArray[np.integer], n_rows: int, region: Region | None
+) -> tuple[NDArray[np.integer], NDArray[np.float64]]:  # fmt: skip
     """Channels that distinguish K labels: each voxel's label, and the labels' values in C channels, (C, K).
 
     `rows` are numbers of the voxels' labels, below `n_rows`, of which K lie in the region. Each label has its value in
@@ -498,7 +505,7 @@ def _one_hot(
     counts = np.bincount((rows if region is None else rows[region.inside]).ravel(), minlength=n_rows)
     present = np.flatnonzero(counts)
     if len(present) < n_rows:
-        index = np.zeros(n_rows, dtype=np.int32)  # 0 beyond the region
+        index = np.zeros(n_rows, dtype=rows.dtype)  # 0 beyond the region
         index[present] = np.arange(len(present))
         rows = index[rows]
     number, fraction = rows, counts[present] / counts.sum()

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.smoothing import FARTHEST_LEVEL, largest_around, near_distance, smooth_level
+from tetopt.contents.smoothing import FARTHEST_LEVEL, largest_around, raw_level, smooth_level
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 
@@ -39,30 +39,44 @@ def region_of(mask: Image) -> Region:
     it, or a gap in it, is one voxel thick. A mask of fractions defines its surface between the voxels and keeps it.
     Where the surface is far, the level counts voxels along the axis on which it is farthest.
     """
-    data = mask.data.astype(np.float64)
-    inside = data >= INSIDE_FRACTION
+    data, inside = mask.data, mask.data >= INSIDE_FRACTION
     if inside.all():
         return Region(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
-    raw = np.where(inside, 0.5 - near_distance(inside), near_distance(~inside) - 0.5)
     if np.any((data > 0.0) & (data < 1.0)):
-        near = np.where(np.abs(raw) < 1.0, np.clip(0.5 - data, -0.5, 0.5), raw)
+        level = raw_level(inside)
+        np.copyto(level, np.clip(0.5 - data.astype(np.float64), -0.5, 0.5), "same_kind", where=np.abs(level) < 1.0)
     else:
-        near = _smoothed(inside, raw)
-    near = np.clip(near, -FARTHEST_LEVEL, FARTHEST_LEVEL)
-    farther = scipy.ndimage.distance_transform_cdt(np.abs(near) >= FARTHEST_LEVEL)
-    return Region(inside, (near + np.copysign(farther, near)).astype(np.float32))
+        level = _smoothed(inside)
+    np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level)
+    farther = scipy.ndimage.distance_transform_cdt(np.abs(level) >= FARTHEST_LEVEL)
+    level += np.copysign(farther, level, dtype=np.float32)
+    return Region(inside, level)
 
 
-def _smoothed(inside: NDArray[np.bool_], raw: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The smooth level of a mask, but `raw` around sheets and gaps of one voxel, which smoothing would tear."""
+def _smoothed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The smooth level of a mask, but the raw one around sheets and gaps of one voxel, which smoothing would tear."""
     wide = np.pad(inside, BEYOND_VOXELS, "edge")
     level = smooth_level(wide, wide, None, (1,))
     is_single = np.zeros(wide.shape, dtype=bool)
     for side in (wide, ~wide):
-        is_thick = scipy.ndimage.binary_opening(side, np.ones((2,) * side.ndim))
-        is_single |= side & ~largest_around(is_thick, 1)
+        is_single |= side & ~largest_around(_opened(side), 1)
     part = (slice(BEYOND_VOXELS, -BEYOND_VOXELS),) * inside.ndim
-    return np.where(largest_around(is_single, 1)[part], raw, level[part])
+    return np.where(largest_around(is_single, 1)[part], raw_level(inside), level[part])
+
+
+def _opened(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Voxels in cubes of two voxels a side that are inside: a tenth of the time of `scipy.ndimage.binary_opening`."""
+    whole = inside
+    for axis in range(inside.ndim):
+        rows = np.moveaxis(whole, axis, 0)
+        whole = np.moveaxis(rows[:-1] & rows[1:], 0, axis)
+    for axis in range(inside.ndim):
+        grown = np.zeros((*inside.shape[: axis + 1], *whole.shape[axis + 1 :]), dtype=bool)
+        rows, part = np.moveaxis(grown, axis, 0), np.moveaxis(whole, axis, 0)
+        rows[:-1] = part
+        rows[1:] |= part
+        whole = grown
+    return whole
 
 
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:

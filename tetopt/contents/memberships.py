@@ -22,6 +22,7 @@ from tetopt.contents.smoothing import FARTHEST_DISTANCE, FARTHEST_LEVEL, NEAR_SU
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
+from tetopt.system.slabs import over_slabs
 
 PARTITION_BYTES = 40.0  # per voxel, in addition to levels: its label, the nearest label, and temporaries
 NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
@@ -41,7 +42,7 @@ class Memberships(NamedTuple):
     labels: NDArray[np.int64]  # (K,) labels present, ascending
     channel: NDArray[np.int64]  # (K,) row of `levels` for each label; labels nowhere near one another share one
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
-    partition: NDArray[np.int32]  # (*shape) row of `labels` with the smallest level at each voxel
+    partition: NDArray[np.integer]  # (*shape) row of `labels` with the smallest level at each voxel
     parts: int = 1  # voxels of this grid per voxel of the labels
 
 
@@ -96,20 +97,30 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     InputError
         Labels that are not whole numbers from 0.
     """
-    labels = checked_labels("labels", labels)
-    factors = tuple(factors or (1,) * labels.ndim)
-    assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
+    return memberships_of(*numbered(checked_labels("labels", labels)), tuple(factors or (1,) * labels.ndim))
+
+
+def numbered(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
+    """The labels present, (K,), ascending, and the number of each voxel's label among them; 16 bits if K^2 fits."""
     values = np.unique(labels.data)
-    # With `return_inverse`, voxels are sorted, in 12 times the time.
-    start: NDArray[np.integer]
-    start = raw = np.searchsorted(values, labels.data).astype(np.int32)
-    values = values.astype(np.int64)
-    n_voxels = labels.data.size * prod(factors)
+    rows = np.empty(labels.shape, dtype=np.int16 if (len(values) + 1) ** 2 <= 1 << 15 else np.int32)
+
+    def fill(first: int, stop: int) -> None:  # with `return_inverse`, voxels are sorted, in 12 times the time
+        rows[first:stop] = np.searchsorted(values, labels.data[first:stop])
+
+    over_slabs(fill, len(rows), rows.size)
+    return values.astype(np.int64), rows
+
+
+def memberships_of(values: NDArray[np.int64], start: NDArray[np.integer], factors: tuple[int, ...]) -> Memberships:
+    """`memberships` of numbered labels."""
+    assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
+    raw, n_voxels = start, start.size * prod(factors)
     what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:
         what += f" (after division by {' x '.join(map(str, factors))})"
     check_memory(PARTITION_BYTES * n_voxels, what, NO_ROOM)
-    off = None if max(factors) == 1 else np.zeros(labels.shape, dtype=np.float32)
+    off = None if max(factors) == 1 else np.zeros(start.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
         if off is not None and factor > 1:
             off = np.maximum(np.repeat(off, factor, axis), _off_planes(start, axis, factor))
@@ -203,7 +214,9 @@ def gathered(
     what = f"labels: {len(values)} labels on {start.size} voxels"
     check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * start.size, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
-    smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int32)
+    partition, smallest = start, None  # on undivided voxels every centre keeps its label
+    if parts > 1:
+        smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros_like(start)
     boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]
     sizes = [prod(side.stop - side.start for side in box) for box in boxes]
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
@@ -211,10 +224,13 @@ def gathered(
         small = {row: threads.submit(level_in, row, boxes[row]) for row, n in enumerate(sizes) if n < LARGE_BOX}
         for row in range(len(values)):
             level = small.pop(row).result() if row in small else level_in(row, boxes[row])
-            shared, least = levels[channel[row]][boxes[row]], smallest[boxes[row]]
+            shared = levels[channel[row]][boxes[row]]
             np.minimum(shared, level, out=shared)
-            partition[boxes[row]][level < least] = row
-            np.minimum(least, level, out=least)
+            if smallest is not None:
+                least = smallest[boxes[row]]
+                partition[boxes[row]][level < least] = row
+                np.minimum(least, level, out=least)
+            del level  # before the next one
     return Memberships(values, channel, levels, partition, parts)
 
 
@@ -325,7 +341,7 @@ def _merge_crumbs(
         partition[is_crumb] = new
 
 
-def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
+def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[int]) -> NDArray[np.integer]:
     """Labels on slices divided along one axis, interpolated by shape.
 
     Within a slice a label's level is the signed distance to its outline; between slices it is linear. A component that
@@ -344,7 +360,7 @@ def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[in
     length[axis] = ABSENT_DISTANCE
     divided = [factors[axis] if i == axis else 1 for i in range(number.ndim)]
     shape = tuple(n * f for n, f in zip(number.shape, divided, strict=True))
-    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int32)
+    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=number.dtype)
     for row, box in enumerate(scipy.ndimage.find_objects(number + 1)):
         margin = tuple(slice(max(s.start - 1, 0), min(s.stop + 1, n)) for s, n in zip(box, number.shape, strict=True))
         fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))

@@ -61,29 +61,38 @@ def smooth_level(
     reach = np.minimum(largest_around(within, REACH_VOXELS), largest_around(without, REACH_VOXELS)).reshape(whole)
     square = (without.view(np.int8) - within.view(np.int8)).reshape(whole)
     del within, without
-    level, raw = RAW_LEVELS[square + np.int16(FARTHEST_SQUARE)], raw.reshape(whole)
+    level, raw = _levels_of(square), raw.reshape(whole)
     off = np.zeros((0, 0, 0), dtype=np.float32) if off is None else off.reshape(whole)
-    sigma, is_broad = max(VOLUME_SIGMA, *factors), bool(BROAD_FRACTIONS[reach.max()] > 0.0)
+    sigma = max(VOLUME_SIGMA, *factors)
     for _ in range(FLOW_STEPS):
-        smooth = _flowed(level, FINE_SIGMA, n)
-        if is_broad:
-            broad = _flowed(level, BROAD_SIGMA, n)
-            _blend(smooth, broad, reach)
-        level = _with_volume(smooth, raw, sigma, square, off, n)
+        level = _stepped(level, reach, n)
+        _keep_volume(level, raw, sigma, square, off, n)
     if max(factors) == 1:  # once more, between voxel centres: walls of two voxels would be 2 % too thick
-        level = _with_volume(level, raw, sigma, square, off, n, is_exact=True)
+        _keep_volume(level, raw, sigma, square, off, n, is_exact=True)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level).reshape(inside.shape)
 
 
-def near_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance to the nearest voxel centre outside, voxels; 0 outside, clipped where it is far."""
-    return DISTANCES[_near_squares(inside)]
+def raw_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Distance to the nearest voxel centre on the other side less 0.5, voxels; negative inside, clipped where far."""
+    return _levels_of(_near_squares(~inside).view(np.int8) - _near_squares(inside).view(np.int8))
+
+
+def _levels_of(square: NDArray[np.int8]) -> NDArray[np.float32]:
+    """`RAW_LEVELS` in slabs, as an index takes eight bytes a voxel."""
+    level = np.empty(square.shape, dtype=np.float32)
+
+    def fill(first: int, stop: int) -> None:
+        level[first:stop] = RAW_LEVELS[square[first:stop] + np.int16(FARTHEST_SQUARE)]
+
+    over_slabs(fill, len(level), level.size)
+    return level
 
 
 def _near_squares(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Squares of `near_distance`: the least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012).
+    """Squares of distances to the nearest voxel centre outside; 0 outside, clipped where it is far.
 
-    As only short steps matter, all are tried, in bytes: a tenth of the time of scipy's transform.
+    The least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short steps matter, all
+    are tried, in bytes: a tenth of the time of scipy's transform.
     """
     assert FARTHEST_SQUARE + (FARTHEST_DISTANCE - 1) ** 2 < 256
     square = np.where(inside, np.uint8(FARTHEST_SQUARE), np.uint8(0))
@@ -114,22 +123,33 @@ def largest_around(values: NDArray, reach: int) -> NDArray:
     return np.ascontiguousarray(values)
 
 
-def _flowed(level: NDArray[np.float32], sigma: float, n: int) -> NDArray[np.float32]:
-    """2 G - G^2 of a level (s_0, s_1, s_2), for the Gaussian G along its last n axes."""
+def _stepped(level: NDArray[np.float32], reach: NDArray[np.uint8], n: int) -> NDArray[np.float32]:
+    """A step of the flow, with the broad Gaussian where nothing within `reach` is thin; the level is overwritten."""
+    is_broad = BROAD_FRACTIONS[reach.max()] > 0.0
+    broad = _flowed(level, BROAD_SIGMA, n, np.empty_like(level)) if is_broad else None
+    smooth = _flowed(level, FINE_SIGMA, n, level)
+    if broad is not None:
+        _blend(smooth, broad, reach)
+    return smooth
+
+
+def _flowed(level: NDArray[np.float32], sigma: float, n: int, rest: NDArray[np.float32]) -> NDArray[np.float32]:
+    """2 G - G^2 of a level (s_0, s_1, s_2), for the Gaussian G along its last n axes; `rest` gets what G removes."""
     weights = np.exp(-0.5 / (sigma * sigma) * np.arange(int(3.0 * sigma + 0.5) + 1) ** 2)
     weights /= np.concatenate([weights[:0:-1], weights]).sum()
-    once, rest, result = np.empty_like(level), np.empty_like(level), np.empty_like(level)
+    result = np.empty_like(level)
 
     def fill_once(first: int, stop: int) -> None:
-        _fill_correlated(once[first:stop], level, weights, first, n)
-        np.subtract(level[first:stop], once[first:stop], out=rest[first:stop])
+        _fill_correlated(result[first:stop], level, weights, first, n)
 
-    def fill(first: int, stop: int) -> None:
-        _fill_correlated(result[first:stop], rest, weights, first, n)
-        result[first:stop] += once[first:stop]
+    def add_again(first: int, stop: int) -> None:
+        again = np.empty_like(rest[first:stop])
+        _fill_correlated(again, rest, weights, first, n)
+        result[first:stop] += again
 
     over_slabs(fill_once, len(level), level.size)
-    over_slabs(fill, len(level), level.size)
+    over_slabs(lambda a, b: np.subtract(level[a:b], result[a:b], out=rest[a:b]), len(level), level.size)
+    over_slabs(add_again, len(level), level.size)
     return result
 
 
@@ -192,11 +212,11 @@ def _blend_planes(smooth: NDArray, broad: NDArray, reach: NDArray) -> None:
                 smooth[i, j, k] += BROAD_FRACTIONS[reach[i, j, k]] * (broad[i, j, k] - smooth[i, j, k])
 
 
-def _with_volume(
+def _keep_volume(
     level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, square: NDArray[np.int8],
     off: NDArray[np.float32], n: int, is_exact: bool = False,
-) -> NDArray[np.float32]:  # fmt: skip
-    """Raise or lower the level smoothly, so that it has the label's volume within `sigma`.
+) -> None:  # fmt: skip
+    """Raise or lower the level smoothly, in place, so that it has the label's volume within `sigma`.
 
     It stays within the bounds of `_bounds`.
     """
@@ -217,11 +237,8 @@ def _with_volume(
     both = np.stack([missing, area]).reshape(2, *blocks[3 - n :])
     missing, area = np.concatenate(over_slabs(lambda a, b: _blurred(both[a:b], sigma), 2, level.size, 2))
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**n, missing / np.maximum(area, 1e-3), np.float32(0.0))
-    lowered, result = lowered.reshape(blocks), np.empty_like(level)
-    over_slabs(
-        lambda first, stop: _fill_lowered(result, level, lowered, square, off, first, stop), len(level), level.size
-    )
-    return result
+    lowered = lowered.reshape(blocks)
+    over_slabs(lambda first, stop: _lower(level, lowered, square, off, first, stop), len(level), level.size)
 
 
 def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
@@ -337,9 +354,7 @@ def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_lowered(
-    result: NDArray, level: NDArray, lowered: NDArray, square: NDArray, off: NDArray, start: int, stop: int
-) -> None:  # fmt: skip
+def _lower(level: NDArray, lowered: NDArray, square: NDArray, off: NDArray, start: int, stop: int) -> None:
     """Lower a level by values for blocks, linear between their centres, and keep it within bounds, in some planes."""
     first, part = np.zeros((3, max(level.shape)), dtype=np.int64), np.zeros((3, max(level.shape)), dtype=np.float32)
     for axis in range(3):
@@ -363,7 +378,7 @@ def _fill_lowered(
                 c = first[2, z]
                 here = row[c] + (row[min(c + 1, len(row) - 1)] - row[c]) * part[2, z]
                 low, high = _bounds(square[x, y, z], off[x, y, z] if len(off) > 0 else np.float32(0.0))
-                result[x, y, z] = min(max(level[x, y, z] - here, low), high)
+                level[x, y, z] = min(max(level[x, y, z] - here, low), high)
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -155,6 +155,7 @@ def read_source(
         level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = _foreground(image, level, labels)
     labels, mask, kept = _chosen(options, labels, mask, table, kept)
+    del finest, beside  # the files as read: their memory is needed
     balance = balance_of(options)
     if options.weights is None and is_own:
         whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
@@ -280,6 +281,7 @@ def _labelling(
         return ReadLabels(table=table)
     labels = beside(options.labels, _align_of_labels(options, numbers))
     is_own = is_alone and np.array_equal(labels.data, image.data)
+    labels = image if is_own else labels  # kept once
     return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
 
 

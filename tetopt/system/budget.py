@@ -6,6 +6,7 @@ be checked in advance. Those of a process (`ulimit -v`) make an allocation fail,
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import sys
@@ -117,6 +118,12 @@ def peak_bytes() -> int:
     if (row := re.search(r"^VmHWM:\s+(\d+) kB", status, re.M)) is not None:
         return 1024 * int(row.group(1))
     return 0 if resource is None else _maxrss(resource.RUSAGE_SELF)
+
+
+def return_freed() -> None:
+    """Return freed memory to the system, of which glibc keeps arrays of up to 32 MB; other C libraries do without."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)
 
 
 def forget_peak() -> None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numba
 import numpy as np
 
-SLABS_PER_THREAD = 4  # as some take longer than others
+SLABS_PER_THREAD = 16  # as some take longer than others, and temporaries are as large as a slab
 SLAB_ELEMENTS = 1 << 16  # of a slab at least: waking a thread for fewer takes longer than their work
 
 Result = TypeVar("Result")
