@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_opening, map_coordinates
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
-from tetopt.contents.domain import Region, levels, region_of
+from tetopt.contents.domain import Region, _opened, levels, region_of
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import mask_fidelity
@@ -190,3 +190,11 @@ def test_too_thin_for_its_cells():
         tetopt.InputError, match="thinner than the cells, so no cell is left inside; increase the number"
     ):
         clipped(moved, image, region_of(image))
+
+
+@pytest.mark.parametrize("shape", [(13, 15, 11), (20, 31), (9, 1, 12)])
+def test_voxels_in_cubes_of_two_are_scipys(shape):
+    rng = np.random.default_rng(0)
+    for fraction in (0.7, 0.9, 0.97):
+        inside = rng.random(shape) < fraction
+        np.testing.assert_array_equal(_opened(inside), binary_opening(inside, np.ones((2,) * len(shape))))

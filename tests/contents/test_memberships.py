@@ -7,7 +7,7 @@ from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
 
 import tetopt
-from tetopt.contents.memberships import finer, finer_affine, labels_at, memberships, supersampling
+from tetopt.contents.memberships import finer, finer_affine, labels_at, memberships, numbered, supersampling
 from tetopt.contents.smoothing import FARTHEST_DISTANCE, raw_level
 
 
@@ -59,6 +59,15 @@ def test_every_voxel_keeps_its_label():
         np.testing.assert_array_equal(members.labels, [0, 3, 4, 90])
         np.testing.assert_array_equal(members.labels[members.partition], labels)
         np.testing.assert_array_equal(members.levels.argmin(axis=0), members.channel[members.partition])
+
+
+@pytest.mark.parametrize("n_labels", [180, 181])
+def test_numbers_of_labels_leave_room_for_those_of_pairs(n_labels):
+    labels = np.arange(200).reshape(10, 20) % n_labels * 3
+    values, rows = numbered(tetopt.Image(labels))
+    np.testing.assert_array_equal(values[rows], labels)
+    pairs = (n_labels + 1) * rows + n_labels
+    np.testing.assert_array_equal(pairs, (n_labels + 1) * rows.astype(np.int64) + n_labels)
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9)])

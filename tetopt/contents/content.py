@@ -217,7 +217,8 @@ class Content(NamedTuple):
             return Spread(*self.statistics[:4])
         if self.continuation is None:
             return Spread(self.given.mean, *self.given.range, self.given.variance)
-        h = self.own.data[self.continuation.inside]
+        around = () if self.whole is None else self.continuation.part
+        h = self.given.data[around][self.continuation.inside]
         return Spread(float(h.mean(dtype=np.float64)), float(h.min()), float(h.max()), _variance(h, None))
 
     @property
@@ -425,12 +426,8 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     if inside.all():
         return Continuation(part, inside, np.empty(0, dtype=np.int64))
     nearest = scipy.ndimage.distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
-    outside = ~inside
-    flat = np.zeros(np.count_nonzero(outside), dtype=np.int32 if inside.size < 2**31 else np.int64)
-    for n, place in zip(inside.shape, nearest, strict=True):
-        flat *= n
-        flat += place[outside]
-    return Continuation(part, inside, flat)
+    flat = np.ravel_multi_index(tuple(nearest[:, ~inside]), inside.shape)
+    return Continuation(part, inside, flat.astype(np.int32 if inside.size < 2**31 else np.int64))
 
 
 def continued(image: Image, mask: Image | Continuation | None) -> Image:
@@ -442,9 +439,10 @@ def continued(image: Image, mask: Image | Continuation | None) -> Image:
         return image
     beyond = continuation(mask, image.spacing) if isinstance(mask, Image) else mask
     part = _part(image, beyond.part)
-    data = part.data.copy()
+    data, affine = part.data.copy(), part.affine
+    del part  # a copy, too
     data[~beyond.inside] = data.ravel()[beyond.nearest]
-    return Image(data, part.affine)
+    return Image(data, affine)
 
 
 def _part(image: Image, part: tuple[slice, ...]) -> Image:

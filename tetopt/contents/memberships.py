@@ -179,7 +179,7 @@ def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], near:
     """
     inside = members.partition[box] == row
     place = np.flatnonzero(_mask_of(near, inside.shape))
-    place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)]
+    place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)].copy()  # not as a view, which keeps all
     is_own, n = inside.ravel()[place], inside.ndim
     at = np.stack(np.unravel_index(place, inside.shape), axis=1) + [side.start for side in box]
     index = np.repeat(at, PLACES_PER_VOXEL, axis=0)

@@ -39,7 +39,7 @@ from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
 from tetopt.start.memory import bytes_of, next_bytes
 from tetopt.start.octree import is_for_walls
-from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes
+from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes, return_freed
 from tetopt.system.files import check_space, kept_places
 
 CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
@@ -95,6 +95,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
         note("`start`: curved edges become straight, as there are no labels or mask for their nodes to follow")
     seconds = {"load": first - begin, "optimize": time.perf_counter() - first}
+    return_freed()  # by the search
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     memory = {"predicted_bytes": most_bytes(n_nodes)}
     return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
@@ -137,6 +138,7 @@ def _aim(task: Task) -> Aim:
 
 def _prepare(task: Task) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
+    return_freed()  # temporaries of the contents and the initial mesh
     content, k_D, mode = task.source.content, task.plan.engine_options["k_D"], task.plan.mode
     prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
 

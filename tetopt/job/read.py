@@ -22,7 +22,7 @@ from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
-from tetopt.system.budget import available_bytes, return_freed
+from tetopt.system.budget import available_bytes
 
 
 def read(job: Job) -> Task:
@@ -71,7 +71,6 @@ def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one piece."""
     start = None if plan.job.start is None else read_mesh(plan.job.start)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
-    return_freed()  # temporaries, before the initial mesh and the optimisation take theirs
     if start is not None:
         image, path = source.contrasts[0], Path(str(plan.job.start))
         _check_place(start.mesh, image, str(path))

@@ -37,7 +37,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
-from tetopt.system.budget import peak_bytes
+from tetopt.system.budget import peak_bytes, return_freed
 from tetopt.system.files import kept_places
 
 
@@ -109,6 +109,7 @@ def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, st
 
 def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> dict[str, Any]:
     """Measure the fit to mask, labels, contrasts and sizes."""
+    return_freed()  # by writing the mesh
     source = task.source
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed, source.content)
     if (table := _table_of(source)) is not None and table.names:
