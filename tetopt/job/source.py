@@ -161,12 +161,12 @@ def read_source(
         whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
         note(f"the image is also {whose}: only the {used} are used")
         balance = balance._replace(weights=[0.0])
-    represented = content(
+    combined = content(
         contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components,
         keep_volumes=not options.free_volumes,
     )  # fmt: skip
     if max(factors) > 1:
-        represented = represented._replace(repeats=factors)
+        combined = combined._replace(repeats=factors)
     of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
     files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
     inputs = {
@@ -191,8 +191,7 @@ def read_source(
         "box": box_text(box_of(image)),
         **({} if mask is None else {MASK_TEXT: mask_text(mask)}),
     }
-    source = Source(paths, balance.weights, represented, contrasts, labels, mask, about, NO_TABLE, image)
-    return source.with_table(table)
+    return Source(paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE, image).with_table(table)
 
 
 def _without_holes(
