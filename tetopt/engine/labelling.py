@@ -340,11 +340,18 @@ def label_voxels(
     `partition` has -1 at voxels outside a mask, which neither link components nor touch a label. Voxels of the labels
     are divided into `parts` of its own.
     """
-    steps, n_rows = [np.moveaxis(partition, d, 0) for d in range(partition.ndim)], n_labels + 1  # the last row: outside
-    area = np.zeros(n_rows * n_rows)
-    for rows, step in zip(steps, spacing, strict=True):
-        pairs = n_rows * (rows[:-1] % n_rows) + rows[1:] % n_rows
-        area += np.prod(spacing) / step * np.bincount(pairs.ravel(), minlength=len(area))
+    n_rows, n_voxels = n_labels + 1, partition.size  # the last row: outside
+
+    def count(first: int, stop: int) -> NDArray[np.int64]:
+        counts = np.empty((partition.ndim, n_rows * n_rows), dtype=np.int64)
+        for d in range(partition.ndim):
+            rows = np.moveaxis(partition[first : stop + (d == 0)], d, 0)
+            pairs = n_rows * (rows[:-1] % n_rows) + rows[1:] % n_rows
+            counts[d] = np.bincount(pairs.ravel(), minlength=counts.shape[1])
+        return counts
+
+    faces = np.prod(spacing) / spacing
+    area = (faces[:, None] * np.sum(over_slabs(count, len(partition), n_voxels), axis=0)).sum(axis=0)
     area = area.reshape(n_rows, n_rows) + area.reshape(n_rows, n_rows).T
     np.fill_diagonal(area, 0.0)
     area[-1] = area[:, -1] = 0.0
@@ -352,10 +359,20 @@ def label_voxels(
     is_apart = area < LEAST_CONTACT_FRACTION * np.minimum(surface[:, None], surface)
     np.fill_diagonal(is_apart, False)
     is_place = np.zeros(partition.shape, dtype=bool)
-    for d, rows in enumerate(steps):
-        is_met, here = is_apart[rows[:-1], rows[1:]], np.moveaxis(is_place, d, 0)
-        here[:-1] |= is_met
-        here[1:] |= is_met
+
+    def mark(first: int, stop: int) -> None:
+        low = max(first - 1, 0)
+        part = partition[low : stop + 1]
+        is_met = np.zeros(part.shape, dtype=bool)
+        for d in range(part.ndim):
+            rows, here = np.moveaxis(part, d, 0), np.moveaxis(is_met, d, 0)
+            is_between = is_apart[rows[:-1], rows[1:]]
+            here[:-1] |= is_between
+            here[1:] |= is_between
+        is_place[first:stop] = is_met[first - low : stop - low]
+
+    if is_apart.any():
+        over_slabs(mark, len(partition), n_voxels)
     sizes, pieces = _components(partition, n_labels, parts * COMPONENT_VOXELS)
     return LabelVoxels(sizes, pieces, is_apart[:-1, :-1].copy(), np.flatnonzero(is_place))
 
