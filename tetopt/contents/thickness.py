@@ -30,10 +30,11 @@ CROSSING_BYTES = 2.0  # per voxel and step
 BEYOND_REGION = -1  # stands for a label beyond the region
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
 COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
-CROSSING_PLANES = 48  # planes of a slab, at least: crossings are kept for those around it, too
+SLAB_PLANES = 48  # planes of a slab, at least: crossings and steps are counted in those around it, too
 MOST_STEPS = 255  # counted steps within a label
 LEAST_COSINE = 0.75  # between the shortest chord and a normal; smaller at creases, which have no normal
 BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
+ABOVE = 1.0 + 1e-9  # times an upper limit of a chord: above it, however rounded
 OFF_MIDDLE_STEPS = 1.01  # largest difference of the two ways along the shortest chord through a middle
 
 
@@ -110,7 +111,7 @@ def thickness_between(
     shape, n = partition.shape, partition.ndim
     whole = (1,) * (3 - n) + shape
     steps = _rays(spacing)[0][0]
-    reach = 2.0 * most / float(min(spacing)) + CROSSING_PLANES  # in how many planes each thread keeps crossings
+    reach = 2.0 * most / float(min(spacing)) + SLAB_PLANES  # in how many planes each thread keeps crossings
     fraction = min(numba.get_num_threads() * reach / whole[3 - n], 1.0)
     n_bytes = THICKNESS_BYTES + CROSSING_BYTES * len(steps) * fraction
     check_memory(n_bytes * partition.size, "thickness of labels", "crop the image")
@@ -131,7 +132,6 @@ def _thickness(
     whole = (1,) * axis + partition.shape
     labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, np.zeros((0, 1, 1, 1), np.uint16))
     (steps, lengths), edges = _rays(spacing)
-    n_steps = _steps_within(labels.partition, min(int(most / lengths.min()) + 1, MOST_STEPS))
     ways = np.cumsum(np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1)
     rays = steps, ways, edges
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
@@ -139,7 +139,7 @@ def _thickness(
 
     def fill(slab: tuple[tuple[int, int], ...]) -> None:
         if corners is None:
-            _fill_chords(chord, is_middle, labels, n_steps, rays, most, slab)
+            _fill_chords(chord, is_middle, labels, rays, most, reach, slab)
             return
         # Crossings are kept as far from the slab as chords reach: 26 bytes a voxel of these planes alone.
         first, stop = slab[axis]
@@ -149,33 +149,14 @@ def _thickness(
         crossing = np.full((len(steps), *near.partition.shape), NO_CROSSING, dtype=np.uint16)
         _fill_crossings(crossing, corners, steps * edges, edges, ends, axis)
         moved = (*slab[:axis], (first - ends[0], stop - ends[0]), *slab[axis + 1 :])
-        _fill_chords(
-            chord[around], is_middle[around], near._replace(crossing=crossing), n_steps[around], rays, most, moved
-        )
+        near = near._replace(crossing=crossing)
+        _fill_chords(chord[around], is_middle[around], near, rays, most, reach, moved)
 
-    n_slabs = None if corners is None else max(whole[axis] // CROSSING_PLANES, numba.get_num_threads())
+    n_slabs = max(whole[axis] // SLAB_PLANES, numba.get_num_threads())
     _over_slabs(fill, whole, n, n_slabs)
     thickness = chord.copy()
     _over_slabs(lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab), whole, n)
     return thickness.reshape(partition.shape)
-
-
-def _steps_within(partition: NDArray[np.int16], most: int) -> NDArray[np.uint8]:
-    """Number of steps from each voxel, in all directions alike and up to `most`, that stay within its label."""
-    is_within = np.ones(partition.shape, dtype=bool)  # all voxels around have the same label
-    n_steps = np.zeros(partition.shape, dtype=np.uint8)
-    for step in range(most):
-        for axis in range(partition.ndim):
-            rows, was = np.moveaxis(is_within, axis, 0), np.moveaxis(is_within.copy(), axis, 0)
-            if step == 0:
-                label = np.moveaxis(partition, axis, 0)
-                is_same = label[1:] == label[:-1]
-                rows[1:] &= is_same
-                rows[:-1] &= is_same
-            rows[1:] &= was[:-1]
-            rows[:-1] &= was[1:]
-        n_steps += is_within
-    return n_steps
 
 
 def _over_slabs(
@@ -196,30 +177,46 @@ def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_chords(
-    chord: NDArray, is_middle: NDArray, labels: _Labels, n_steps: NDArray, rays: tuple[NDArray, NDArray, NDArray],
-    most: float, slab: tuple[tuple[int, int], ...],
+    chord: NDArray, is_middle: NDArray, labels: _Labels, rays: tuple[NDArray, NDArray, NDArray], most: float,
+    reach: int, slab: tuple[tuple[int, int], ...],
 ) -> None:  # fmt: skip
     """Fill in the shortest chord through each voxel of a slab, across its surfaces, and mark voxels in its middle.
 
-    Ways begin after the steps that stay within the label, which takes a fraction of the time.
+    Ways begin after the steps that stay within the label, which are counted from voxel to voxel, from as many planes
+    (rows in 2-D) beyond the slab as chords reach: a tenth of the time of walking from each voxel.
     """
-    steps, ways, edges = rays
-    for i in range(*slab[0]):
-        for j in range(*slab[1]):
+    (steps, ways, edges), partition = rays, labels.partition
+    low, high = max(slab[1][0] - reach, 0), min(slab[1][1] + reach, partition.shape[1])
+    before, after = max(slab[0][0] - reach, 0), min(slab[0][1] + reach, partition.shape[0])
+    first, size, most_steps = slab[0][0], (len(steps), high - low, partition.shape[2]), min(reach, MOST_STEPS)
+    up, beyond = np.zeros((slab[0][1] - first, *size), dtype=np.uint8), np.zeros((2, *size), dtype=np.uint8)
+    part = partition[:, low:high]
+    for i in range(after - 1, first - 1, -1):
+        here = up[i - first] if i < slab[0][1] else beyond[i % 2]
+        last = up[i + 1 - first] if i + 1 < slab[0][1] else beyond[(i + 1) % 2]
+        _count_steps(here, last, part, i, steps, most_steps)
+    for i in range(before, slab[0][1]):
+        down = beyond[i % 2]
+        _count_steps(down, beyond[(i + 1) % 2], part, i, -steps, most_steps)
+        for j in range(slab[1][0], slab[1][1] if i >= first else slab[1][0]):
             for k in range(*slab[2]):
-                if labels.partition[i, j, k] < 0:
+                if partition[i, j, k] < 0:
                     continue
-                least, off_middle, shortest, n = most, np.inf, -1, n_steps[i, j, k]
+                least, off_middle, shortest = most, np.inf, -1
+                for d in range(len(steps)):  # a chord ends within a step of both voxels, if these are known
+                    n, m = up[i - first, d, j - low, k], down[d, j - low, k]
+                    if max(n, m) < most_steps:
+                        least = min(least, (ways[d, n + 1] + ways[d, m + 1]) * ABOVE)
                 for d in range(len(steps)):
-                    farthest = least - ways[d, n]  # as the way back is no shorter
-                    if ways[d, n] >= farthest:
+                    n, m = up[i - first, d, j - low, k], down[d, j - low, k]
+                    if ways[d, n] + ways[d, m] >= least:
                         continue
                     step = row(steps, d)
-                    forth = _way(labels, (i, j, k), (d, step), ways, n, farthest)
-                    if forth >= farthest:
+                    forth = _way(labels, (i, j, k), (d, step), ways, n, least)
+                    if forth + ways[d, m] >= least:
                         continue
                     step = (-step[0], -step[1], -step[2])
-                    back = _way(labels, (i, j, k), (-1 - d, step), ways, n, least - forth)
+                    back = _way(labels, (i, j, k), (-1 - d, step), ways, m, least - forth)
                     if forth + back < least:
                         least, off_middle, shortest = forth + back, abs(forth - back) / ways[d, 1], d
                 if shortest >= 0:
@@ -230,6 +227,31 @@ def _fill_chords(
                     least *= 0.5 * (forth + back)
                 chord[i, j, k] = least
                 is_middle[i, j, k] = off_middle <= OFF_MIDDLE_STEPS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int) -> None:
+    """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up to `most`.
+
+    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, where steps across planes lead: all of them in the same sense.
+    """
+    _, n_rows, n_columns = partition.shape
+    for d in range(len(steps)):
+        a, s, t = i + steps[d, 0], steps[d, 1], steps[d, 2]
+        is_in = 0 <= a < len(partition)
+        source, begin, size = count if a == i else last, max(-t, 0), n_columns - abs(t)
+        for number in range(n_rows):
+            j = n_rows - 1 - number if s > 0 or (s == 0 and t > 0) else number
+            b = j + s
+            if not (is_in and 0 <= b < n_rows):
+                count[d, j] = most
+                continue
+            count[d, j, 0] = count[d, j, n_columns - 1] = most
+            own, other = partition[i, j, begin : begin + size], partition[a, b, begin + t : begin + t + size]
+            here, there = count[d, j, begin : begin + size], source[d, b, begin + t : begin + t + size]
+            for m in range(size):
+                at = size - 1 - m if t > 0 and b == j else m
+                here[at] = min(there[at] + 1, most) if own[at] == other[at] else 0
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
@@ -322,10 +344,11 @@ def _spread_balls(
                     x = 0.0 if a == i else ((a - i) * edges[0]) ** 2
                     for b in range(max(j - r1, slab[1][0]), min(j + r1 + 1, slab[1][1])):
                         y = x + ((b - j) * edges[1]) ** 2
+                        if y > r * r:
+                            continue
                         for c in range(max(k - r2, slab[2][0]), min(k + r2 + 1, slab[2][1])):
-                            is_same = partition[a, b, c] == partition[i, j, k]
-                            is_in = y + ((c - k) * edges[2]) ** 2 <= r * r
-                            if is_same and is_in and thickness[a, b, c] < size:
+                            is_in = thickness[a, b, c] < size and y + ((c - k) * edges[2]) ** 2 <= r * r
+                            if is_in and partition[a, b, c] == partition[i, j, k]:
                                 thickness[a, b, c] = size
 
 
