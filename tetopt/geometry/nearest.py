@@ -20,7 +20,8 @@ class _Search(NamedTuple):
 
     squares: Floats1
     points: Floats2
-    corners: Floats2  # three rows a triangle
+    nodes: Floats2
+    facets: Ints2  # three nodes a triangle
     start: Ints1  # of each bin in `listed`, and the end of the last
     listed: Ints1  # triangles, bin after bin
     counts: Ints1  # bins along each axis
@@ -28,26 +29,28 @@ class _Search(NamedTuple):
     size: float  # a bin's edge
 
 
-def triangle_distances(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of points (K, 3) from the nearest of triangles (T, 3, 3), one or more, (K,) float64 in their unit.
+def triangle_distances(
+    points: NDArray[np.float64], nodes: NDArray[np.float64], facets: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Distance of points (K, 3) from the nearest of triangles (T, 3), one or more, of nodes (P, 3): (K,), in their unit.
 
     Flat triangles count as their edges, or as a single point.
     """
-    a, b, c = corners.swapaxes(0, 1)
-    boxes = [extreme(extreme(a, b), c) for extreme in (np.minimum, np.maximum)]  # ten times as fast as by axis
-    low = boxes[0].min(axis=0)
-    extent = boxes[1].max(axis=0) - low
-    size = float(extent.max()) / len(corners) ** BINS_POWER or 1.0
+    is_used = np.zeros(len(nodes), dtype=bool)
+    is_used[facets] = True
+    low = nodes[is_used].min(axis=0)
+    extent = nodes[is_used].max(axis=0) - low
+    size = float(extent.max()) / len(facets) ** BINS_POWER or 1.0
     counts = (extent / size).astype(np.int64) + 1
-    ends = [((side - low) / size).astype(np.int64) for side in boxes]
+    bins, facets = ((nodes - low) / size).astype(np.int64), np.ascontiguousarray(facets)
     start = np.zeros(counts.prod() + 2, dtype=np.int64)
-    _list_by_bin(start[2:], np.empty(0, dtype=np.int64), *ends, counts)
+    _list_by_bin(start[2:], np.empty(0, dtype=np.int64), bins, facets, counts)
     np.cumsum(start, out=start)
     listed = np.empty(start[-1], dtype=np.int64)
-    _list_by_bin(start[1:], listed, *ends, counts)  # moves each bin's start to that of the next one
+    _list_by_bin(start[1:], listed, bins, facets, counts)  # moves each bin's start to that of the next one
     squares = np.full(len(points), np.inf)
-    rows = np.ascontiguousarray(corners.reshape(-1, 3))
-    work = _Search(squares, np.ascontiguousarray(points), rows, start[:-1], listed, counts, low, size)
+    points, nodes = np.ascontiguousarray(points), np.ascontiguousarray(nodes)
+    work = _Search(squares, points, nodes, facets, start[:-1], listed, counts, low, size)
     run(_fill_squares, -(-len(points) // POINTS_PER_TASK), work)
     return np.sqrt(squares)
 
@@ -56,12 +59,16 @@ def triangle_distances(points: NDArray[np.float64], corners: NDArray[np.float64]
 
 
 @entry
-def _list_by_bin(place: Ints1, listed: Ints1, low: Ints2, high: Ints2, counts: Ints1) -> None:
-    """Count the triangles whose bounding boxes reach each bin, or list them, starting at the place of each bin."""
-    for triangle in range(len(low)):
-        for i in range(low[triangle, 0], high[triangle, 0] + 1):
-            for j in range(low[triangle, 1], high[triangle, 1] + 1):
-                for k in range(low[triangle, 2], high[triangle, 2] + 1):
+def _list_by_bin(place: Ints1, listed: Ints1, bins: Ints2, facets: Ints2, counts: Ints1) -> None:
+    """Count the triangles whose bounding boxes reach each bin, or list them, starting at the place of each bin.
+
+    `bins` (P, 3) are those of the triangles' nodes.
+    """
+    for triangle in range(len(facets)):
+        a, b, c = row(bins, facets[triangle, 0]), row(bins, facets[triangle, 1]), row(bins, facets[triangle, 2])
+        for i in range(min(a[0], b[0], c[0]), max(a[0], b[0], c[0]) + 1):
+            for j in range(min(a[1], b[1], c[1]), max(a[1], b[1], c[1]) + 1):
+                for k in range(min(a[2], b[2], c[2]), max(a[2], b[2], c[2]) + 1):
                     at = (i * counts[1] + j) * counts[2] + k
                     if len(listed) > 0:
                         listed[place[at]] = triangle
@@ -93,8 +100,8 @@ def _triangle_square(p: tuple, a: tuple, b: tuple, c: tuple) -> float:
 def _bin_square(work: _Search, p: tuple, at: int, least: float) -> float:
     """Squared distance of p from the triangles of a bin, or the least so far if that is smaller."""
     for place in range(work.start[at], work.start[at + 1]):
-        corner = 3 * work.listed[place]
-        a, b, c = row(work.corners, corner), row(work.corners, corner + 1), row(work.corners, corner + 2)
+        facet = row(work.facets, work.listed[place])
+        a, b, c = row(work.nodes, facet[0]), row(work.nodes, facet[1]), row(work.nodes, facet[2])
         least = min(least, _triangle_square(p, a, b, c))
     return least
 

@@ -34,6 +34,7 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
+from tetopt.system.kernel_cache import njit
 
 POINTS_PER_CELL = 24  # points per cell for comparison with the voxels
 MOST_POINTS = 20_000  # on a surface, for measuring distances
@@ -463,6 +464,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
         World coordinates in mm, accurate to 1e-5 voxel; without facets if the field does not cross 1/2.
     """
     import pyvista  # slow to load, and only needed with a mask or labels
+    from vtkmodules.util.numpy_support import vtk_to_numpy
 
     level = np.asarray(level)
     n = level.ndim
@@ -470,12 +472,12 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     grid = pyvista.ImageData(dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n))
     grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(order="F")
     surface = grid.contour([INSIDE_FRACTION], scalars="level", compute_normals=False, compute_gradients=False)
-    listed = surface.faces if n == 3 else surface.lines  # the points of each follow their number
+    nodes = vtk_to_numpy((surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray())
     # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
     # copy, one voxel out, has the same coordinates along the other axes at the face of the box, half a voxel out.
     index = np.clip(np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5)
     return FacetSurface(
-        transformed(index, affine[:-1, :-1]) + affine[:-1, -1], listed.reshape(-1, n + 1)[:, 1:].astype(np.int64)
+        transformed(index, affine[:-1, :-1]) + affine[:-1, -1], nodes.reshape(-1, n).astype(np.int64)
     )
 
 
@@ -484,10 +486,10 @@ def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDA
 
     The surface has at least one facet; flat facets count, too.
     """
-    corners = surface.points[surface.facets]
+    nodes, facets_ = surface
     if points.shape[1] == 2:  # segments are flat triangles
-        points, corners = np.pad(points, ((0, 0), (0, 1))), np.pad(corners[:, [0, 1, 1]], ((0, 0), (0, 0), (0, 1)))
-    return triangle_distances(points, corners)
+        points, nodes, facets_ = np.pad(points, ((0, 0), (0, 1))), np.pad(nodes, ((0, 0), (0, 1))), facets_[:, [0, 1, 1]]
+    return triangle_distances(points, nodes, facets_)
 
 
 def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -642,13 +644,23 @@ def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDA
 
 def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
     """Area of each triangle, or length of each segment, (T,) float64."""
-    nodes = surface.facets.T
-    corners = [np.ascontiguousarray(axis)[nodes] for axis in surface.points.T]  # axis by axis: three times as fast
-    along = [corner[1:] - corner[0] for corner in corners]
-    if len(along) == 2:
-        return np.hypot(along[0][0], along[1][0])
-    (ax, bx), (ay, by), (az, bz) = along
-    return np.asarray(0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2))
+    if surface.points.shape[1] == 2:
+        first, second = (surface.points[nodes].T for nodes in surface.facets.T)
+        return np.hypot(*(second - first))
+    x, y, z = facet_vectors(*surface).T
+    return np.asarray(0.5 * np.sqrt(x**2 + y**2 + z**2))
+
+
+@njit(cache=True, nogil=True)
+def facet_vectors(points: NDArray, facets_: NDArray) -> NDArray:
+    """Vectors (T, 3) across triangles (T, 3) of points (P, 3), as long as twice their areas."""
+    vectors = np.empty((len(facets_), 3))
+    for t in range(len(facets_)):
+        a, b, c = facets_[t, 0], facets_[t, 1], facets_[t, 2]
+        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        vectors[t, 0], vectors[t, 1], vectors[t, 2] = y * w - z * v, z * u - x * w, x * v - y * u
+    return vectors
 
 
 def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
