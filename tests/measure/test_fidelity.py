@@ -14,7 +14,7 @@ from tetopt.measure.fidelity import (
     MOST_POINTS,
     FacetSurface,
     _distances,
-    _painted,
+    painted_voxels,
     cell_labels,
     euler_characteristic,
     evenly_spread,
@@ -95,7 +95,7 @@ def test_cell_labels_against_twin(n):
     assert of_cell.dtype == np.int64
     assert n_ties > 3
     assert n_empty > 3
-    shown = _painted(owner, of_cell, -1)
+    shown = painted_voxels(owner, of_cell, -1)
     assert (shown == -1).any()
     for voxel in np.ndindex(labels.shape):
         assert shown[voxel] == (-1 if owner[voxel] < 0 else of_cell[owner[voxel]])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
 from tetopt.image import Image, transformed
+from tetopt.system.kernel_cache import njit
 
 LARGEST_LABEL = 2**31 - 1  # largest signed 32-bit integer, the widest type of labels in most programs
 ROUNDING_DISTANCE = 1e-3  # by which values may differ from whole numbers: interpolated or scaled headers leave less
@@ -139,10 +140,13 @@ def voxel_components(
 
     The voxels are in a `box` of the grid with this affine, by default at its corner.
     """
-    start = [side.start for side in box] or 0
-    number, n_components = scipy.ndimage.label(inside)
-    sizes, met = (np.bincount(number[which], minlength=n_components + 1) for which in (inside, inside & is_met))
-    index = np.argwhere(((sizes > 0) & (met == 0))[number])
+    n_components, n_met = counted_components(inside, is_met)
+    if n_met == n_components:
+        return n_components, ()
+    start, number = [side.start for side in box] or 0, scipy.ndimage.label(inside)[0]
+    is_lost = np.ones(n_components + 1, dtype=bool)
+    is_lost[number[inside & is_met]] = is_lost[0] = False
+    sizes, index = np.bincount(number.ravel()), np.argwhere(is_lost[number])
     of_voxel = number[tuple(index.T)]
     sums = np.column_stack([np.bincount(of_voxel, along, n_components + 1) for along in index.T])
     middle = sums / np.maximum(sizes, 1)[:, None]
@@ -151,6 +155,64 @@ def voxel_components(
     places = transformed(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
     rows = zip(sizes[of_voxel[near]].tolist(), places.tolist(), strict=True)
     return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
+
+
+def counted_components(
+    inside: NDArray[np.bool_], is_met: NDArray[np.bool_], *, has_corners: bool = False
+) -> tuple[int, int]:
+    """Number of components of voxels that faces connect, or corners, too, and of those with a voxel that `is_met`."""
+    whole = (1,) * (3 - inside.ndim) + inside.shape
+    return _counted_components(inside.reshape(whole), is_met.reshape(whole), int(has_corners))  # type: ignore[no-any-return]
+
+
+@njit(cache=True, nogil=True)
+def _counted_components(inside: NDArray, is_met: NDArray, reach: int) -> tuple[int, int]:
+    """Components of runs of voxels along the last axis; a run joins the runs of earlier rows that it touches."""
+    n_planes, n_rows, n_columns = inside.shape
+    first, n_runs = np.zeros(n_planes * n_rows + 1, dtype=np.int64), 0
+    for at in range(n_planes * n_rows):
+        own, was = inside[at // n_rows, at % n_rows], False
+        for k in range(n_columns):
+            n_runs += own[k] and not was
+            was = own[k]
+        first[at + 1] = n_runs
+    begin, end = np.empty(n_runs, dtype=np.int32), np.empty(n_runs, dtype=np.int32)
+    root, has_met, number = np.arange(n_runs), np.zeros(n_runs, dtype=np.bool_), -1
+    for at in range(n_planes * n_rows):
+        i, j, was = at // n_rows, at % n_rows, False
+        for k in range(n_columns):
+            if inside[i, j, k]:
+                if not was:
+                    number += 1
+                    begin[number] = k
+                end[number] = k
+                has_met[number] |= is_met[i, j, k]
+            was = inside[i, j, k]
+        for a, b in ((i, j - 1), (i - 1, j - 1), (i - 1, j), (i - 1, j + 1)):
+            if a < 0 or b < 0 or b == n_rows or (a != i and b != j and reach == 0):
+                continue
+            other = first[a * n_rows + b]
+            for run in range(first[at], first[at + 1]):
+                while other < first[a * n_rows + b + 1] and end[other] < begin[run] - reach:
+                    other += 1
+                touched = other
+                while touched < first[a * n_rows + b + 1] and begin[touched] <= end[run] + reach:
+                    one, two = _root(root, run), _root(root, touched)
+                    root[max(one, two)] = min(one, two)
+                    touched += 1
+    for run in range(n_runs):
+        has_met[_root(root, run)] |= has_met[run]
+    is_root = root == np.arange(n_runs)
+    return is_root.sum(), (is_root & has_met).sum()
+
+
+@njit(cache=True, nogil=True)
+def _root(root: NDArray, run: int) -> int:
+    """The first run of a run's component, so far; ways to it are halved."""
+    while root[run] != run:
+        root[run] = root[root[run]]
+        run = root[run]
+    return run
 
 
 def label_channels(number: NDArray[np.integer], n_labels: int) -> NDArray[np.int64]:

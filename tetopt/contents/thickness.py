@@ -76,7 +76,9 @@ def local_thickness(
         Not enough memory for it.
     """
     check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
-    partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    partition = members.partition.astype(np.int16)
+    if inside is not None:
+        partition[~inside] = BEYOND_REGION
     whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
     levels = members.levels.reshape(-1, *whole)
     return _thickness(partition, levels, members.channel, None, spacing, most)
@@ -130,7 +132,7 @@ def _thickness(
     """`local_thickness` of labels by row (-1 beyond the region), between levels or facets' corners on a 3-D grid."""
     n, axis = partition.ndim, 3 - partition.ndim
     whole = (1,) * axis + partition.shape
-    labels = _Labels(partition.reshape(whole).astype(np.int16), levels, channel, np.zeros((0, 1, 1, 1), np.uint16))
+    labels = _Labels(partition.reshape(whole).astype(np.int16, copy=False), levels, channel, np.zeros((0, 1, 1, 1), np.uint16))
     (steps, lengths), edges = _rays(spacing)
     ways = np.cumsum(np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1)
     rays = steps, ways, edges

@@ -227,9 +227,14 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh
         )
 
 
-def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Boundary facets, (B, n) nodes, and True for those on a face of the image's box, (B,)."""
-    outer = boundary_facets(mesh.cells)
+def facets_on_box(
+    mesh: Mesh, image: Image, shared: Facets | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Boundary facets, (B, n) nodes, and True for those on a face of the image's box, (B,).
+
+    `shared` are the mesh's facets, if already known.
+    """
+    outer = boundary_facets(mesh.cells, shared)
     is_on = facets_on_sides(image.to_index(mesh.points), outer, box_sides(image.shape))
     return outer, np.any(is_on, axis=(1, 2))
 

@@ -209,12 +209,12 @@ def linked(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[in
     return int(count), number.astype(np.int64)
 
 
-def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """The connected set of each cell, (M,) int64; cells that share a facet are connected.
 
-    Sets are numbered from 0 in the order of their first cell.
+    Sets are numbered from 0 in the order of their first cell. `shared` are the cells' facets, if already known.
     """
-    sides = facets(cells).cells
+    sides = (facets(cells) if shared is None else shared).cells
     sides = sides[sides[:, 1] >= 0]
     _, number = linked(sides[:, 0], sides[:, 1], len(cells))
     _, first, inverse = np.unique(number, return_index=True, return_inverse=True)

@@ -35,8 +35,10 @@ from tetopt.geometry.topology import Facets, components, facets, lexicographic_o
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
+from tetopt.system.slabs import over_slabs
 
 POINTS_PER_CELL = 24  # points per cell for comparison with the voxels
+CHUNK_CELLS = 4096  # compared at a time, as voxels near one another stay in a processor's cache
 MOST_POINTS = 20_000  # on a surface, for measuring distances
 FEWEST_POINTS = 1_000  # the least number on the larger of two surfaces
 POINTS_PER_FACE = 4.0  # per area of a voxel's face: the half level bends no faster than that
@@ -254,12 +256,13 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     [1063, 137]
     """
     labels = checked_labels("labels", labels)
-    return _majority(labels, mesh, cell_of_voxel(labels, mesh))
+    return majority(labels, mesh, cell_of_voxel(labels, mesh))
 
 
 def label_fidelity(
-    labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None, mask: Image | None = None
-) -> list[LabelFidelity]:
+    labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None, mask: Image | None = None,
+    owner: NDArray[np.integer] | None = None,
+) -> list[LabelFidelity]:  # fmt: skip
     """Measure how well cells represent each label of an image.
 
     Without a mask, the space outside the mesh counts as label 0: its voxels get label 0, the mesh's boundary off the
@@ -276,6 +279,8 @@ def label_fidelity(
         Label of each cell; `cell_labels` by default.
     mask : Image, optional
         Mask on the same voxels; only voxels of 1/2 or more count.
+    owner : (s_0, ..., s_{n-1}) array of int, optional
+        Cell of each voxel, -1 outside the mesh, if known.
 
     Returns
     -------
@@ -300,24 +305,21 @@ def label_fidelity(
     label 1: Dice 1.00, off by 0.5 mm
     """
     labels, (pieces, n_pieces) = checked_labels("labels", labels), mesh.straight_pieces()
-    owner = cell_of_voxel(labels, pieces) // n_pieces
+    owner = voxel_cells(labels, mesh) if owner is None else owner
     label_of_cell = cell_labels(labels, mesh) if of_cell is None else checked_cell_labels(of_cell, mesh)
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    painted, is_covered = _painted(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
+    painted, is_covered = painted_voxels(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
+    n_true, n_cells = voxel_counts(true, len(values)), np.bincount(label_of_cell, minlength=len(values))
+    n_covered = voxel_counts(np.where(is_covered, true, OUTSIDE_LABEL), len(values))
     is_met = (painted == true) | ~is_covered
-    dice = _voxel_dice(true, painted, len(values))
-    of_most = _painted(owner, _most_frequent(true, owner, label_of_cell), outside)
-    dice_majority = _voxel_dice(true, of_most, len(values))
-
-    def counts(rows: NDArray[np.integer], weights: NDArray | None = None) -> NDArray:
-        return np.bincount(rows, weights, len(values))
-
-    n_true, n_cells = counts(true[true >= 0]), counts(label_of_cell)
-    n_covered = counts(true[is_covered & (true >= 0)])
-    of_piece, mesh_volume = np.repeat(label_of_cell, n_pieces), counts(label_of_cell, mesh.cell_volumes)
-    n_empty = counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
-    overlap, size, beyond = _overlaps(Image(true, labels.affine), pieces, of_piece, len(n_true))
+    dice = _voxel_dice(true, painted, n_true)
+    of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
+    dice_majority = _voxel_dice(true, of_most, n_true)
+    of_piece, is_empty = np.repeat(label_of_cell, n_pieces), voxel_counts(owner, len(mesh.cells)) == 0
+    mesh_volume = np.bincount(label_of_cell, mesh.cell_volumes, len(values))
+    n_empty = np.bincount(label_of_cell[is_empty], minlength=len(values))
+    overlap, size, beyond = _overlaps(labels, true, pieces, of_piece, len(n_true))
     has_outside = (np.arange(len(n_true)) == outside).astype(float)
     boxes = scipy.ndimage.find_objects(true + 1)
     shared = facets(pieces.cells)
@@ -361,28 +363,47 @@ def label_fidelity(
 
 
 def _overlaps(
-    labels: Image, mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
+    labels: Image, rows: NDArray[np.integer], mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
-    """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
+    """Volume of each label's voxels (by row) in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
 
     Estimated from `POINTS_PER_CELL` points that fill each cell evenly.
     """
     n, size = mesh.ndim, volumes(mesh.points, mesh.cells)
     steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, POINTS_PER_CELL + 1), EVEN_STEPS[3][:n]), 1.0), axis=1)
     weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are uniform in a simplex
-    own, none = np.zeros(len(size)), np.zeros(len(size))
-    for weight in weights:
-        labels_there = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
-        own += labels_there == label_of_cell
-        none += labels_there == 0
+    own, none, inverse = np.zeros(len(size)), np.zeros(len(size)), np.linalg.inv(labels.affine[:-1, :-1])
+    for first in range(0, len(size), CHUNK_CELLS):
+        part = slice(first, first + CHUNK_CELLS)
+        corners, counts = mesh.points[mesh.cells[part]], (own[part], none[part], label_of_cell[part])
+        for weight in weights:
+            places = np.einsum("k,mkn->mn", weight, corners)
+            _count_labels(*counts, places, labels.affine[:-1, -1], inverse, rows.ravel(), rows.shape)
     overlap = np.bincount(label_of_cell, own * size / POINTS_PER_CELL, n_labels).astype(np.float64)
     rest = max(labels.volume - float(size.sum()), 0.0)
-    background = float((labels.data == 0).sum()) * labels.voxel_volume - float((none * size).sum() / POINTS_PER_CELL)
+    background = float((rows == 0).sum()) * labels.voxel_volume - float((none * size).sum() / POINTS_PER_CELL)
     filled = np.bincount(label_of_cell, size, n_labels).astype(np.float64)
     return overlap, filled, (min(max(background, 0.0), rest), rest)
 
 
-def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
+@njit(cache=True, nogil=True)
+def _count_labels(
+    own: NDArray, none: NDArray, label_of_cell: NDArray, places: NDArray, origin: NDArray, inverse: NDArray,
+    rows: NDArray, shape: tuple[int, ...],
+) -> None:  # fmt: skip
+    """Add 1 for each cell at whose place (M, n) is its label, and where label 0 is, as `nearest_values` finds them."""
+    for cell in range(len(places)):
+        at = 0
+        for axis in range(places.shape[1]):
+            index = (places[cell, 0] - origin[0]) * inverse[axis, 0]
+            for column in range(1, places.shape[1]):
+                index += (places[cell, column] - origin[column]) * inverse[axis, column]
+            at = at * shape[axis] + min(max(int(np.rint(index)), 0), shape[axis] - 1)
+        own[cell] += rows[at] == label_of_cell[cell]
+        none[cell] += rows[at] == 0
+
+
+def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = None) -> MaskFidelity:
     """Measure how well a mesh fills a mask and follows its boundary.
 
     Parameters
@@ -391,6 +412,8 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
         From 0, outside, to 1, inside; fractions are partial volumes.
     mesh : Mesh
         Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes exact.
+    owner : (s_0, ..., s_{n-1}) array of int, optional
+        Cell of each voxel, -1 outside the mesh, if known.
 
     Returns
     -------
@@ -416,10 +439,12 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
     pieces = mesh.straight_pieces()[0]
-    is_filled, is_inside = cell_of_voxel(mask, pieces) >= 0, mask.data >= INSIDE_FRACTION
+    is_filled = (voxel_cells(mask, mesh) if owner is None else owner) >= 0
+    is_inside = mask.data >= INSIDE_FRACTION
     n_components, lost = voxel_components(is_inside, is_filled, mask.affine)
     n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
-    outer, is_on_box = facets_on_box(pieces, mask)
+    shared = facets(pieces.cells)
+    outer, is_on_box = facets_on_box(pieces, mask, shared)
     ours = FacetSurface(mask.to_index(pieces.points), outer[~is_on_box])
     theirs = half_level_surface(mask.data, np.eye(mask.ndim + 1))
     there, back = _distances(ours, theirs, 1.0)
@@ -438,7 +463,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
         *_mean_and_p95(there_mm),
         *_mean_and_p95(back_mm),
         n_components,
-        _n_components(mesh.cells),
+        int(components(mesh.cells, shared if pieces is mesh else None).max()) + 1,
         euler_characteristic(theirs.facets),
         euler_characteristic(ours.facets),
         lost,
@@ -528,10 +553,19 @@ def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
     data = labels.data.astype(np.int32)
     if mask is not None and mask.shape != labels.shape:
         raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
-    return data if mask is None else np.where(mask.data >= INSIDE_FRACTION, data, np.int32(OUTSIDE_LABEL))
+    if mask is not None:
+        data[mask.data < INSIDE_FRACTION] = OUTSIDE_LABEL
+    return data
 
 
-def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
+def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
+    """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight pieces."""
+    pieces, n_pieces = mesh.straight_pieces()
+    owner = cell_of_voxel(image, pieces).astype(np.int32)
+    return owner if n_pieces == 1 else owner // np.int32(n_pieces)
+
+
+def majority(labels: Image, mesh: Mesh, owner: NDArray[np.integer]) -> NDArray[np.int64]:
     """`cell_labels` from the cell of each voxel."""
     nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
     values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
@@ -539,7 +573,7 @@ def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np
 
 
 def _most_frequent(
-    rows: NDArray[np.int32], owner: NDArray[np.int64], otherwise: NDArray[np.int64]
+    rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """The most frequent row of the voxels of each cell, the smallest of equally frequent ones, or `otherwise` (M,)."""
     of_cell, most = otherwise.copy(), np.zeros_like(otherwise)
@@ -551,15 +585,37 @@ def _most_frequent(
     return of_cell
 
 
-def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.int32]:
-    """Label of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
-    return np.append(of_cell, outside).astype(np.int32)[owner]
+def painted_voxels(owner: NDArray[np.integer], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.integer]:
+    """Row of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
+    table = _narrow(np.append(of_cell, outside))
+    painted = np.empty(owner.shape, dtype=table.dtype)
+
+    def fill(first: int, stop: int) -> None:  # in slabs, as indices become 64 bits wide
+        painted[first:stop] = table[owner[first:stop]]
+
+    over_slabs(fill, len(owner), owner.size)
+    return painted
 
 
-def _voxel_dice(true: NDArray[np.int32], painted: NDArray[np.int32], n_labels: int) -> NDArray[np.float64]:
-    """Dice of the voxels of each label, (K,), with those that cells give it."""
-    one, other, both = (np.bincount(v[v >= 0], minlength=n_labels) for v in (true, painted, true[true == painted]))
-    return 2.0 * both / np.maximum(one + other, 1)
+def _narrow(rows: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Whole numbers in 16 bits if they and the next one fit, else in 32."""
+    return rows.astype(np.int16 if rows.max(initial=0) < 2**15 - 1 else np.int32)
+
+
+def voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
+    """Number of voxels of each row, (n,); -1 is no row."""
+    parts = over_slabs(
+        lambda first, stop: np.bincount(rows[first:stop].ravel() + 1, minlength=n + 1)[1:], len(rows), rows.size
+    )
+    return np.asarray(sum(parts))
+
+
+def _voxel_dice(
+    true: NDArray[np.integer], painted: NDArray[np.integer], n_true: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the numbers of the former."""
+    both = voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
+    return 2.0 * both / np.maximum(n_true + voxel_counts(painted, len(n_true)), 1)
 
 
 def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
@@ -578,12 +634,18 @@ def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
 
 def by_row(
     labels: NDArray[np.int32], of_cell: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.int64]]:
     """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for `OUTSIDE_LABEL`."""
-    values = np.unique(np.concatenate([[0], np.unique(labels[labels >= 0]), of_cell]))
-    rows = np.searchsorted(values, labels).astype(np.int32)
-    rows[labels < 0] = OUTSIDE_LABEL
-    return values, rows, np.searchsorted(values, of_cell)
+    parts = over_slabs(lambda first, stop: np.unique(labels[first:stop]), len(labels), labels.size)
+    values = np.unique(np.concatenate([[OUTSIDE_LABEL, 0], *parts, of_cell]))
+    numbers = _narrow(np.arange(-1, len(values) - 1))
+    rows = np.empty(labels.shape, dtype=numbers.dtype)
+
+    def fill(first: int, stop: int) -> None:
+        rows[first:stop] = np.searchsorted(values, labels[first:stop]) - 1
+
+    over_slabs(fill, len(labels), labels.size)
+    return values[1:], rows, np.searchsorted(values[1:], of_cell)
 
 
 def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:
@@ -609,14 +671,14 @@ def _labels_beside_facets(
     """All facets (F, n) and the labels on both sides (F, 2), the same label on both sides of the box."""
     sides = of_cell[shared.cells]
     is_outer = shared.n_cells == 1
-    is_on_box = facets_on_box(mesh, labels)[1]  # in the order of the facets
+    is_on_box = facets_on_box(mesh, labels, shared)[1]  # in the order of the facets
     sides[is_outer, 1] = np.where(is_on_box, sides[is_outer, 0], outside)
     return shared.nodes, sides
 
 
 def _with_margin(
-    labels: Image, data: NDArray[np.int32], box: tuple[slice, ...]
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    labels: Image, data: NDArray[np.integer], box: tuple[slice, ...]
+) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
     """The part of an array in a box with a margin of one voxel, where available, and the part's affine."""
     low = np.array([max(side.start - 1, 0) for side in box])
     affine = labels.affine.copy()

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from threading import Lock
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -16,7 +17,7 @@ from tetopt.contents.content import Content, content, continued
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity, voxel_cells
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.thin import contact_totals, label_contacts, label_layers
 from tetopt.mesh import Mesh
@@ -40,13 +41,12 @@ def fidelity(
     whole = partial(_with_levels, what, labels, mask)
     if mask is not None:
         labels, mask = _around(labels, mask, mesh)
-        measures["mask"] = lambda: mask_fidelity(mask, mesh)
+    owner = _once(lambda: voxel_cells(mask or cast(Image, labels), mesh))
+    if mask is not None:
+        measures["mask"] = lambda: mask_fidelity(mask, mesh, owner())
     if labels is not None:
-
-        def own() -> NDArray[np.int64]:
-            return cell_labels(continued(labels, mask), mesh) if of_cell is None else of_cell
-
-        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask)
+        own = _once(lambda: cell_labels(continued(labels, mask), mesh)) if of_cell is None else lambda: of_cell
+        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner())
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
             measures["thickness"] = lambda: label_layers(whole(), mesh, own())
         measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
@@ -64,6 +64,17 @@ def fidelity(
     if "contacts" in measured:
         measured["contact_totals"] = contact_totals(measured["contacts"])
     return measured
+
+
+def _once(make: Callable[[], NDArray]) -> Callable[[], NDArray]:
+    """Return a function that computes an array at its first call alone, on any thread, and then returns the same."""
+    lock, made = Lock(), cache(make)
+
+    def get() -> NDArray:
+        with lock:
+            return made()
+
+    return get
 
 
 def _around(labels: Image | None, mask: Image, mesh: Mesh) -> tuple[Image | None, Image]:

@@ -17,13 +17,20 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.contents.content import Content
 from tetopt.contents.labels import LARGEST_LABEL, checked_labels
 from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, local_thickness, thickness_between
-from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import squared_edges
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.measure.fidelity import FacetSurface, Thickness, checked_cell_labels, labels_in_mask, surface_areas
+from tetopt.measure.fidelity import (
+    FacetSurface,
+    Thickness,
+    checked_cell_labels,
+    labels_in_mask,
+    painted_voxels,
+    surface_areas,
+    voxel_cells,
+)
 from tetopt.mesh import Mesh
 
 THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
@@ -200,39 +207,33 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)
-    rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    rows = members.partition.astype(np.int16)
+    if inside is not None:
+        rows[~inside] = BEYOND_REGION
     thick = local_thickness(members, spacing, most, inside)
     of_voxels = _percentiles(thick, rows, members.labels, most)
     values, row = np.unique(of_cell, return_inverse=True)
-    pieces, n_pieces = mesh.straight_pieces()
-    owner = cell_of_voxel(grid, pieces) // n_pieces
-    rows = np.append(row, BEYOND_REGION).astype(np.int32)[owner]
+    owner, (pieces, n_pieces) = voxel_cells(grid, mesh), mesh.straight_pieces()
+    painted = painted_voxels(owner, row, BEYOND_REGION)
+    number = np.searchsorted(members.labels, values)  # of each label of cells among those of voxels
+    is_known = members.labels[np.minimum(number, len(members.labels) - 1)] == values
+    edge, medians = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1), {}
+    for label, box in enumerate(scipy.ndimage.find_objects(painted + 1)):
+        if box is not None and is_known[label]:
+            is_right = (painted[box] == label) & (rows[box] == number[label])
+            edges = edge[owner[box][is_right]]
+            if len(edges):
+                across = float(np.median(thick[box][is_right] / edges))
+                medians[int(values[label])] = float(np.median(edges)), across
+    del owner, thick, rows
     shared = facets(pieces.cells)
     is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[:, 0].astype(bool)
     corners = (grid.to_index(pieces.points) * spacing)[shared.nodes[is_between]]
-    of_cells = _percentiles(thickness_between(corners, rows, spacing, most), rows, values, most)
-    number = np.searchsorted(members.labels, of_cell)
-    is_known = members.labels[np.minimum(number, len(members.labels) - 1)] == of_cell
-    right = np.append(np.where(is_known, number, -1), -1).astype(np.int32)  # of each cell, and outside
-    is_right = members.partition == right[owner]
-    is_right &= True if inside is None else inside
-    edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)[owner[is_right]]
-    label, across = of_cell[owner[is_right]], thick[is_right] / edge
-    edges, crossed = _medians(label, edge), _medians(label, across)
+    of_cells = _percentiles(thickness_between(corners, painted, spacing, most), painted, values, most)
     return {
-        number: Layers(
-            of_voxels.get(number), of_cells.get(number), edges.get(number, np.nan), crossed.get(number, np.nan)
-        )
-        for number in sorted(of_voxels | of_cells)
+        label: Layers(of_voxels.get(label), of_cells.get(label), *medians.get(label, (np.nan, np.nan)))
+        for label in sorted(of_voxels | of_cells)
     }
-
-
-def _medians(label: NDArray[np.int64], values: NDArray[np.floating]) -> dict[int, float]:
-    """Return the median of the values of each label."""
-    order = np.argsort(label, kind="stable")
-    numbers, starts = np.unique(label[order], return_index=True)
-    parts = np.split(values[order], starts)[1:]
-    return {int(number): float(np.median(part)) for number, part in zip(numbers, parts, strict=True)}
 
 
 def _percentiles(

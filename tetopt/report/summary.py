@@ -73,8 +73,8 @@ def run_summary(
     first, last = result.history[0], result.history[-1]
     own = plain(image)
     is_varied = own.variance > 0.0
-    fractions = (unexplained_by(own, mesh, row) for mesh, row in ((result.mesh, last), (initial, first)))
-    left, left_first = (fraction if is_varied else None for fraction in fractions)
+    left = unexplained_by(own, result.mesh, last) if result.fraction is None else result.fraction
+    left, left_first = (each if is_varied else None for each in (left, unexplained_by(own, initial, first)))
     return {
         **about,
         "versions": versions(),
