@@ -140,16 +140,15 @@ def voxel_components(
 
     The voxels are in a `box` of the grid with this affine, by default at its corner.
     """
-    n_components, n_met = counted_components(inside, is_met)
-    if n_met == n_components:
-        return n_components, ()
-    start, number = [side.start for side in box] or 0, scipy.ndimage.label(inside)[0]
-    is_lost = np.ones(n_components + 1, dtype=bool)
-    is_lost[number[inside & is_met]] = is_lost[0] = False
-    sizes, index = np.bincount(number.ravel()), np.argwhere(is_lost[number])
-    of_voxel = number[tuple(index.T)]
-    sums = np.column_stack([np.bincount(of_voxel, along, n_components + 1) for along in index.T])
-    middle = sums / np.maximum(sizes, 1)[:, None]
+    n_components, lost = component_runs(inside, is_met)
+    component, row, begin, end = lost.T
+    start, length = [side.start for side in box] or 0, end - begin
+    of_voxel = np.repeat(np.unique(component, return_inverse=True)[1], length)
+    along = np.repeat(begin - np.cumsum(length) + length, length) + np.arange(len(of_voxel))
+    index = np.column_stack(np.unravel_index(np.repeat(row, length) * inside.shape[-1] + along, inside.shape))
+    sizes = np.bincount(of_voxel)
+    sums = np.column_stack([np.bincount(of_voxel, column) for column in index.T])
+    middle = sums / sizes[:, None]
     order = np.lexsort((((index - middle[of_voxel]) ** 2).sum(axis=1), of_voxel, -sizes[of_voxel]))
     near = order[np.sort(np.unique(of_voxel[order], return_index=True)[1])]  # the first of each
     places = transformed(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
@@ -157,17 +156,22 @@ def voxel_components(
     return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
 
 
-def counted_components(
+def component_runs(
     inside: NDArray[np.bool_], is_met: NDArray[np.bool_], *, has_corners: bool = False
-) -> tuple[int, int]:
-    """Number of components of voxels that faces connect, or corners, too, and of those with a voxel that `is_met`."""
+) -> tuple[int, NDArray[np.int64]]:
+    """Number of components of voxels that faces connect, or corners, too, and the runs of those without one that is met.
+
+    A run (L, 4) of voxels along the last axis has the number of its component, the number of its row, the first column,
+    and the one after its last.
+    """
     whole = (1,) * (3 - inside.ndim) + inside.shape
-    return _counted_components(inside.reshape(whole), is_met.reshape(whole), int(has_corners))  # type: ignore[no-any-return]
+    n_components, lost = _component_runs(inside.reshape(whole), is_met.reshape(whole), int(has_corners))
+    return int(n_components), lost
 
 
 @njit(cache=True, nogil=True)
-def _counted_components(inside: NDArray, is_met: NDArray, reach: int) -> tuple[int, int]:
-    """Components of runs of voxels along the last axis; a run joins the runs of earlier rows that it touches."""
+def _component_runs(inside: NDArray, is_met: NDArray, reach: int) -> tuple[int, NDArray]:
+    """`component_runs`: each run joins the runs of earlier rows that it touches, within `reach` columns."""
     n_planes, n_rows, n_columns = inside.shape
     first, n_runs = np.zeros(n_planes * n_rows + 1, dtype=np.int64), 0
     for at in range(n_planes * n_rows):
@@ -176,34 +180,32 @@ def _counted_components(inside: NDArray, is_met: NDArray, reach: int) -> tuple[i
             n_runs += own[k] and not was
             was = own[k]
         first[at + 1] = n_runs
-    begin, end = np.empty(n_runs, dtype=np.int32), np.empty(n_runs, dtype=np.int32)
-    root, has_met, number = np.arange(n_runs), np.zeros(n_runs, dtype=np.bool_), -1
+    runs, root = np.empty((n_runs, 4), dtype=np.int64), np.arange(n_runs)  # the run's root is in the first column later
+    has_met, number = np.zeros(n_runs, dtype=np.bool_), -1
     for at in range(n_planes * n_rows):
         i, j, was = at // n_rows, at % n_rows, False
         for k in range(n_columns):
             if inside[i, j, k]:
-                if not was:
-                    number += 1
-                    begin[number] = k
-                end[number] = k
+                number += not was
+                runs[number, 1], runs[number, 2], runs[number, 3] = at, runs[number, 2] if was else k, k + 1
                 has_met[number] |= is_met[i, j, k]
             was = inside[i, j, k]
         for a, b in ((i, j - 1), (i - 1, j - 1), (i - 1, j), (i - 1, j + 1)):
             if a < 0 or b < 0 or b == n_rows or (a != i and b != j and reach == 0):
                 continue
-            other = first[a * n_rows + b]
+            other, stop = first[a * n_rows + b], first[a * n_rows + b + 1]
             for run in range(first[at], first[at + 1]):
-                while other < first[a * n_rows + b + 1] and end[other] < begin[run] - reach:
+                while other < stop and runs[other, 3] + reach <= runs[run, 2]:
                     other += 1
                 touched = other
-                while touched < first[a * n_rows + b + 1] and begin[touched] <= end[run] + reach:
+                while touched < stop and runs[touched, 2] < runs[run, 3] + reach:
                     one, two = _root(root, run), _root(root, touched)
                     root[max(one, two)] = min(one, two)
                     touched += 1
     for run in range(n_runs):
-        has_met[_root(root, run)] |= has_met[run]
-    is_root = root == np.arange(n_runs)
-    return is_root.sum(), (is_root & has_met).sum()
+        runs[run, 0] = _root(root, run)
+        has_met[runs[run, 0]] |= has_met[run]
+    return (root == np.arange(n_runs)).sum(), runs[~has_met[runs[:, 0]]]
 
 
 @njit(cache=True, nogil=True)

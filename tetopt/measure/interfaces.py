@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.contents.labels import checked_labels, counted_components
+from tetopt.contents.labels import checked_labels, component_runs
 from tetopt.geometry.manifold import LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.topology import Facets, facets, linked
@@ -289,7 +289,7 @@ def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
     if is_label.ndim == 2:
         return 0
     outside = ~np.pad(is_label, 1)
-    return counted_components(outside, outside, has_corners=True)[0] - 1
+    return component_runs(outside, outside, has_corners=True)[0] - 1
 
 
 def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges) -> NDArray[np.float64]:
