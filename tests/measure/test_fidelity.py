@@ -14,13 +14,13 @@ from tetopt.measure.fidelity import (
     MOST_POINTS,
     FacetSurface,
     _distances,
-    painted_voxels,
     cell_labels,
     euler_characteristic,
     evenly_spread,
     half_level_surface,
     label_fidelity,
     mask_fidelity,
+    painted_voxels,
     surface_distances,
 )
 

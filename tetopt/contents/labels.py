@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.smoothing import largest_around
@@ -159,7 +158,7 @@ def voxel_components(
 def component_runs(
     inside: NDArray[np.bool_], is_met: NDArray[np.bool_], *, has_corners: bool = False
 ) -> tuple[int, NDArray[np.int64]]:
-    """Number of components of voxels that faces connect, or corners, too, and the runs of those without one that is met.
+    """Number of components of voxels that faces connect, or corners, too, and the runs of those of which none is met.
 
     A run (L, 4) of voxels along the last axis has the number of its component, the number of its row, the first column,
     and the one after its last.

@@ -34,7 +34,7 @@ SLAB_PLANES = 80  # planes of a slab, at least: crossings and steps are counted 
 MOST_STEPS = 255  # counted steps within a label
 LEAST_COSINE = 0.75  # between the shortest chord and a normal; smaller at creases, which have no normal
 BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
-ABOVE = 1.0 + 1e-9  # times an upper limit of a chord: above it, however rounded
+ABOVE_LIMIT = 1.0 + 1e-9  # times an upper limit of a chord: above it, however rounded
 OFF_MIDDLE_STEPS = 1.01  # largest difference of the two ways along the shortest chord through a middle
 
 
@@ -132,7 +132,8 @@ def _thickness(
     """`local_thickness` of labels by row (-1 beyond the region), between levels or facets' corners on a 3-D grid."""
     n, axis = partition.ndim, 3 - partition.ndim
     whole = (1,) * axis + partition.shape
-    labels = _Labels(partition.reshape(whole).astype(np.int16, copy=False), levels, channel, np.zeros((0, 1, 1, 1), np.uint16))
+    rows, no_crossing = partition.reshape(whole).astype(np.int16, copy=False), np.zeros((0, 1, 1, 1), np.uint16)
+    labels = _Labels(rows, levels, channel, no_crossing)
     (steps, lengths), edges = _rays(spacing)
     ways = np.cumsum(np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1)
     rays = steps, ways, edges
@@ -208,7 +209,7 @@ def _fill_chords(
                 for d in range(len(steps)):  # a chord ends within a step of both voxels, if these are known
                     n, m = up[i - first, d, j - low, k], down[d, j - low, k]
                     if max(n, m) < most_steps:
-                        least = min(least, (ways[d, n + 1] + ways[d, m + 1]) * ABOVE)
+                        least = min(least, (ways[d, n + 1] + ways[d, m + 1]) * ABOVE_LIMIT)
                 for d in range(len(steps)):
                     n, m = up[i - first, d, j - low, k], down[d, j - low, k]
                     if ways[d, n] + ways[d, m] >= least:
@@ -235,7 +236,8 @@ def _fill_chords(
 def _count_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int) -> None:
     """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up to `most`.
 
-    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, where steps across planes lead: all of them in the same sense.
+    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, to which steps across
+    planes lead, all of them in the same sense.
     """
     _, n_rows, n_columns = partition.shape
     for d in range(len(steps)):

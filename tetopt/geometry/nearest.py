@@ -32,7 +32,7 @@ class _Search(NamedTuple):
 def triangle_distances(
     points: NDArray[np.float64], nodes: NDArray[np.float64], facets: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Distance of points (K, 3) from the nearest of triangles (T, 3), one or more, of nodes (P, 3): (K,), in their unit.
+    """Distance of points (K, 3) from the nearest of one or more triangles (T, 3) of nodes (P, 3): (K,), in their unit.
 
     Flat triangles count as their edges, or as a single point.
     """

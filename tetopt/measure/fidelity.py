@@ -365,7 +365,7 @@ def label_fidelity(
 def _overlaps(
     labels: Image, rows: NDArray[np.integer], mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
-    """Volume of each label's voxels (by row) in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
+    """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
 
     Estimated from `POINTS_PER_CELL` points that fill each cell evenly.
     """
@@ -501,9 +501,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
     # copy, one voxel out, has the same coordinates along the other axes at the face of the box, half a voxel out.
     index = np.clip(np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5)
-    return FacetSurface(
-        transformed(index, affine[:-1, :-1]) + affine[:-1, -1], nodes.reshape(-1, n).astype(np.int64)
-    )
+    return FacetSurface(transformed(index, affine[:-1, :-1]) + affine[:-1, -1], nodes.reshape(-1, n).astype(np.int64))
 
 
 def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDArray[np.float64]:
@@ -511,10 +509,10 @@ def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDA
 
     The surface has at least one facet; flat facets count, too.
     """
-    nodes, facets_ = surface
+    nodes, corners = surface
     if points.shape[1] == 2:  # segments are flat triangles
-        points, nodes, facets_ = np.pad(points, ((0, 0), (0, 1))), np.pad(nodes, ((0, 0), (0, 1))), facets_[:, [0, 1, 1]]
-    return triangle_distances(points, nodes, facets_)
+        points, nodes, corners = (*(np.pad(each, ((0, 0), (0, 1))) for each in (points, nodes)), corners[:, [0, 1, 1]])
+    return triangle_distances(points, nodes, corners)
 
 
 def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -714,11 +712,11 @@ def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def facet_vectors(points: NDArray, facets_: NDArray) -> NDArray:
+def facet_vectors(points: NDArray, corners: NDArray) -> NDArray:
     """Vectors (T, 3) across triangles (T, 3) of points (P, 3), as long as twice their areas."""
-    vectors = np.empty((len(facets_), 3))
-    for t in range(len(facets_)):
-        a, b, c = facets_[t, 0], facets_[t, 1], facets_[t, 2]
+    vectors = np.empty((len(corners), 3))
+    for t in range(len(corners)):
+        a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]
         x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
         u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
         vectors[t, 0], vectors[t, 1], vectors[t, 2] = y * w - z * v, z * u - x * w, x * v - y * u

@@ -256,13 +256,13 @@ def area_at_volume(surface: FacetSurface, volume: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _node_sums(vectors: NDArray, facets_: NDArray, n_nodes: int) -> NDArray:
+def _node_sums(vectors: NDArray, corners: NDArray, n_nodes: int) -> NDArray:
     """Sums (n_nodes, 3) of the vectors (T, 3) of the facets (T, 3) at each node."""
     sums = np.zeros((n_nodes, 3))
-    for t in range(len(facets_)):
+    for t in range(len(corners)):
         for k in range(3):
             for axis in range(3):
-                sums[facets_[t, k], axis] += vectors[t, axis]
+                sums[corners[t, k], axis] += vectors[t, axis]
     return sums
 
 

@@ -73,8 +73,12 @@ def run_summary(
     first, last = result.history[0], result.history[-1]
     own = plain(image)
     is_varied = own.variance > 0.0
-    left = unexplained_by(own, result.mesh, last) if result.fraction is None else result.fraction
-    left, left_first = (each if is_varied else None for each in (left, unexplained_by(own, initial, first)))
+    known = result.fraction
+    fractions = (
+        unexplained_by(own, result.mesh, last) if known is None else known,
+        unexplained_by(own, initial, first),
+    )
+    left, left_first = (fraction if is_varied else None for fraction in fractions)
     return {
         **about,
         "versions": versions(),
