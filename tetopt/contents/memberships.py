@@ -101,7 +101,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
 
 
 def numbered(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
-    """The labels present, (K,), ascending, and the number of each voxel's label among them; 16 bits if K^2 fits."""
+    """Labels present, (K,), ascending, and the number of each voxel's among them; 16 bits if (K+1)^2 fits."""
     values = np.unique(labels.data)
     rows = np.empty(labels.shape, dtype=np.int16 if (len(values) + 1) ** 2 <= 1 << 15 else np.int32)
 

@@ -25,8 +25,8 @@ from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
 
 THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # percentiles over a label's voxels that describe its thickness
-THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, steps, the labels, and the labels within a region
-CROSSING_BYTES = 2.0  # per voxel and step
+THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, the labels, and the labels within a region
+STEP_BYTES, CROSSING_BYTES = 1.0, 2.0  # per direction, and voxel of the slabs in work
 BEYOND_REGION = -1  # stands for a label beyond the region
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
 COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
@@ -75,7 +75,7 @@ def local_thickness(
     InputError
         Not enough memory for it.
     """
-    check_memory(THICKNESS_BYTES * members.partition.size, "thickness of labels", "crop the image")
+    _check_room(members.partition.shape, STEP_BYTES, spacing, 0.0)
     partition = members.partition.astype(np.int16)
     if inside is not None:
         partition[~inside] = BEYOND_REGION
@@ -93,7 +93,7 @@ def thickness_between(
     ----------
     corners : (F, n, n) float64
         Nodes of each facet between two labels, mm from the centre of the first voxel, along the grid's axes.
-    partition : (s_0, ..., s_{n-1}) int64
+    partition : (s_0, ..., s_{n-1}) array of int
         Label of each voxel's centre, any whole number from 0; -1 beyond the region.
     spacing : (n,) float64
         Edges of the voxels, mm.
@@ -110,19 +110,21 @@ def thickness_between(
     InputError
         Not enough memory.
     """
-    shape, n = partition.shape, partition.ndim
-    whole = (1,) * (3 - n) + shape
-    steps = _rays(spacing)[0][0]
-    reach = 2.0 * most / float(min(spacing)) + SLAB_PLANES  # in how many planes each thread keeps crossings
-    fraction = min(numba.get_num_threads() * reach / whole[3 - n], 1.0)
-    n_bytes = THICKNESS_BYTES + CROSSING_BYTES * len(steps) * fraction
-    check_memory(n_bytes * partition.size, "thickness of labels", "crop the image")
-    if n == 2:  # a segment becomes a rectangle across the plane, of two triangles
+    _check_room(partition.shape, STEP_BYTES + CROSSING_BYTES, spacing, most)
+    if partition.ndim == 2:  # a segment becomes a rectangle across the plane, of two triangles
         flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
         flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and then the second
         corners = np.concatenate([flat[:, :3], flat[:, 1:]])
     no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
     return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), corners, spacing, most)
+
+
+def _check_room(shape: tuple[int, ...], n_bytes: float, spacing: NDArray[np.float64], beyond: float) -> None:
+    """Check the memory for a grid, with `n_bytes` per direction in the slabs in work and `beyond` them, mm."""
+    planes = 2.0 * beyond / float(min(spacing)) + SLAB_PLANES
+    fraction = min(numba.get_num_threads() * planes / shape[0], 1.0)
+    n_bytes = THICKNESS_BYTES + n_bytes * len(_rays(spacing)[0][0]) * fraction
+    check_memory(n_bytes * prod(shape), "thickness of labels", "crop the image")
 
 
 def _thickness(
@@ -197,10 +199,10 @@ def _fill_chords(
     for i in range(after - 1, first - 1, -1):
         here = up[i - first] if i < slab[0][1] else beyond[i % 2]
         last = up[i + 1 - first] if i + 1 < slab[0][1] else beyond[(i + 1) % 2]
-        _count_steps(here, last, part, i, steps, most_steps)
+        _fill_steps(here, last, part, i, steps, most_steps)
     for i in range(before, slab[0][1]):
         down = beyond[i % 2]
-        _count_steps(down, beyond[(i + 1) % 2], part, i, -steps, most_steps)
+        _fill_steps(down, beyond[(i + 1) % 2], part, i, -steps, most_steps)
         for j in range(slab[1][0], slab[1][1] if i >= first else slab[1][0]):
             for k in range(*slab[2]):
                 if partition[i, j, k] < 0:
@@ -233,7 +235,7 @@ def _fill_chords(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int) -> None:
+def _fill_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int) -> None:
     """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up to `most`.
 
     It is `most`, too, where they leave the grid. `last` has the counts of the plane before, to which steps across

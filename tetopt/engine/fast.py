@@ -293,7 +293,7 @@ def prepare_kernels(
     has_labels = content.memberships is not None
     if method == "fast":
         unused = {_gradients, _evaluate_triangles if image.ndim == 3 else _evaluate_cells}
-        if not has_labels and content.region is None:  # 4 of 79 s
+        if not has_labels and content.region is None:  # 4 of 79 s of compiling
             unused |= {_attract, _fill_offsets}
         purposes = {
             "density": is_graded or image.ndim == 3,

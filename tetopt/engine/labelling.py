@@ -351,7 +351,8 @@ def label_voxels(
         return counts
 
     faces = np.prod(spacing) / spacing
-    area = (faces[:, None] * np.sum(over_slabs(count, len(partition), n_voxels), axis=0)).sum(axis=0)
+    n_slabs = max(n_voxels // (8 * partition.ndim * n_rows**2), 1)  # all counts take a byte per voxel at most
+    area = (faces[:, None] * sum(over_slabs(count, len(partition), n_voxels, n_slabs))).sum(axis=0)
     area = area.reshape(n_rows, n_rows) + area.reshape(n_rows, n_rows).T
     np.fill_diagonal(area, 0.0)
     area[-1] = area[:, -1] = 0.0

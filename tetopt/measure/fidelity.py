@@ -256,7 +256,9 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     [1063, 137]
     """
     labels = checked_labels("labels", labels)
-    return majority(labels, mesh, cell_of_voxel(labels, mesh))
+    nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
+    values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
+    return values[_most_frequent(rows, cell_of_voxel(labels, mesh), nearest)]
 
 
 def label_fidelity(
@@ -310,15 +312,15 @@ def label_fidelity(
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
     painted, is_covered = painted_voxels(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
-    n_true, n_cells = voxel_counts(true, len(values)), np.bincount(label_of_cell, minlength=len(values))
-    n_covered = voxel_counts(np.where(is_covered, true, OUTSIDE_LABEL), len(values))
+    n_true, n_cells = _voxel_counts(true, len(values)), np.bincount(label_of_cell, minlength=len(values))
+    n_covered = _voxel_counts(np.where(is_covered, true, OUTSIDE_LABEL), len(values))
     is_met = (painted == true) | ~is_covered
     dice = _voxel_dice(true, painted, n_true)
     of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
     dice_majority = _voxel_dice(true, of_most, n_true)
-    of_piece, is_empty = np.repeat(label_of_cell, n_pieces), voxel_counts(owner, len(mesh.cells)) == 0
+    of_piece, n_owned = np.repeat(label_of_cell, n_pieces), np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
     mesh_volume = np.bincount(label_of_cell, mesh.cell_volumes, len(values))
-    n_empty = np.bincount(label_of_cell[is_empty], minlength=len(values))
+    n_empty = np.bincount(label_of_cell[n_owned == 0], minlength=len(values))
     overlap, size, beyond = _overlaps(labels, true, pieces, of_piece, len(n_true))
     has_outside = (np.arange(len(n_true)) == outside).astype(float)
     boxes = scipy.ndimage.find_objects(true + 1)
@@ -563,13 +565,6 @@ def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
     return owner if n_pieces == 1 else owner // np.int32(n_pieces)
 
 
-def majority(labels: Image, mesh: Mesh, owner: NDArray[np.integer]) -> NDArray[np.int64]:
-    """`cell_labels` from the cell of each voxel."""
-    nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
-    values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
-    return values[_most_frequent(rows, owner, nearest)]
-
-
 def _most_frequent(
     rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: NDArray[np.int64]
 ) -> NDArray[np.int64]:
@@ -600,20 +595,22 @@ def _narrow(rows: NDArray[np.integer]) -> NDArray[np.integer]:
     return rows.astype(np.int16 if rows.max(initial=0) < 2**15 - 1 else np.int32)
 
 
-def voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
+def _voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
     """Number of voxels of each row, (n,); -1 is no row."""
-    parts = over_slabs(
-        lambda first, stop: np.bincount(rows[first:stop].ravel() + 1, minlength=n + 1)[1:], len(rows), rows.size
-    )
-    return np.asarray(sum(parts))
+
+    def count(first: int, stop: int) -> NDArray[np.int64]:
+        return np.bincount(rows[first:stop].ravel() + 1, minlength=n + 1)[1:]
+
+    n_slabs = max(rows.size // (8 * (n + 1)), 1)  # all counts take a byte per voxel at most
+    return np.asarray(sum(over_slabs(count, len(rows), rows.size, n_slabs)))
 
 
 def _voxel_dice(
     true: NDArray[np.integer], painted: NDArray[np.integer], n_true: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the numbers of the former."""
-    both = voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
-    return 2.0 * both / np.maximum(n_true + voxel_counts(painted, len(n_true)), 1)
+    both = _voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
+    return 2.0 * both / np.maximum(n_true + _voxel_counts(painted, len(n_true)), 1)
 
 
 def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
@@ -712,11 +709,11 @@ def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def facet_vectors(points: NDArray, corners: NDArray) -> NDArray:
+def facet_vectors(points: NDArray, nodes: NDArray) -> NDArray:
     """Vectors (T, 3) across triangles (T, 3) of points (P, 3), as long as twice their areas."""
-    vectors = np.empty((len(corners), 3))
-    for t in range(len(corners)):
-        a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]
+    vectors = np.empty((len(nodes), 3))
+    for t in range(len(nodes)):
+        a, b, c = nodes[t, 0], nodes[t, 1], nodes[t, 2]
         x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
         u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
         vectors[t, 0], vectors[t, 1], vectors[t, 2] = y * w - z * v, z * u - x * w, x * v - y * u

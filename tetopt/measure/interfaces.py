@@ -256,13 +256,13 @@ def area_at_volume(surface: FacetSurface, volume: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _node_sums(vectors: NDArray, corners: NDArray, n_nodes: int) -> NDArray:
+def _node_sums(vectors: NDArray, nodes: NDArray, n_nodes: int) -> NDArray:
     """Sums (n_nodes, 3) of the vectors (T, 3) of the facets (T, 3) at each node."""
     sums = np.zeros((n_nodes, 3))
-    for t in range(len(corners)):
+    for t in range(len(nodes)):
         for k in range(3):
             for axis in range(3):
-                sums[corners[t, k], axis] += vectors[t, axis]
+                sums[nodes[t, k], axis] += vectors[t, axis]
     return sums
 
 
@@ -335,7 +335,7 @@ def _cell_eulers(
 
 
 def _distinct(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Distinct numbers, ascending; sorting takes a fifth of the time of `np.unique`, which hashes them."""
+    """Distinct numbers, ascending; sorting takes less time than `np.unique`, which hashes them."""
     ordered = np.sort(numbers, axis=None)
     return ordered[np.append(True, ordered[1:] != ordered[:-1])]
 
