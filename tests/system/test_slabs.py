@@ -74,3 +74,17 @@ def test_smoothing_kernels_equal_scipy():
     bits = data > 0.02
     for reach in (1, 2, 6):
         assert np.array_equal(smoothing.largest_around(bits, reach), maximum_filter(bits, 2 * reach + 1))
+
+
+@pytest.mark.parametrize("n_counts", [1, 20, 10**6])
+def test_counts_are_summed_within_a_byte_per_element(many_slabs, n_counts):
+    sizes = []
+
+    def count(first, stop):
+        sizes.append(8 * n_counts)
+        return np.full(n_counts, stop - first)
+
+    total = slabs.sum_over_slabs(count, 40, 4000, n_counts)
+    assert (total == 40).all()
+    assert len(sizes) == 1 or sum(sizes) <= 4000
+    assert n_counts > 20 or len(sizes) > 1

@@ -76,9 +76,7 @@ def local_thickness(
         Not enough memory for it.
     """
     _check_room(members.partition.shape, STEP_BYTES, spacing, 0.0)
-    partition = members.partition.astype(np.int16)
-    if inside is not None:
-        partition[~inside] = BEYOND_REGION
+    partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
     levels = members.levels.reshape(-1, *whole)
     return _thickness(partition, levels, members.channel, None, spacing, most)

@@ -32,7 +32,7 @@ from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
 from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
-from tetopt.system.slabs import over_slabs
+from tetopt.system.slabs import over_slabs, sum_over_slabs
 
 TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
 # of a label's volume near its surface, the most that tension and mending may take, and that mending may add: with a
@@ -351,8 +351,8 @@ def label_voxels(
         return counts
 
     faces = np.prod(spacing) / spacing
-    n_slabs = max(n_voxels // (8 * partition.ndim * n_rows**2), 1)  # all counts take a byte per voxel at most
-    area = (faces[:, None] * sum(over_slabs(count, len(partition), n_voxels, n_slabs))).sum(axis=0)
+    counts = sum_over_slabs(count, len(partition), n_voxels, partition.ndim * n_rows**2)
+    area = (faces[:, None] * counts).sum(axis=0)
     area = area.reshape(n_rows, n_rows) + area.reshape(n_rows, n_rows).T
     np.fill_diagonal(area, 0.0)
     area[-1] = area[:, -1] = 0.0

@@ -35,7 +35,7 @@ from tetopt.geometry.topology import Facets, components, facets, lexicographic_o
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
-from tetopt.system.slabs import over_slabs
+from tetopt.system.slabs import over_slabs, sum_over_slabs
 
 POINTS_PER_CELL = 24  # points per cell for comparison with the voxels
 CHUNK_CELLS = 4096  # compared at a time, as voxels near one another stay in a processor's cache
@@ -465,7 +465,7 @@ def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = N
         *_mean_and_p95(there_mm),
         *_mean_and_p95(back_mm),
         n_components,
-        int(components(mesh.cells, shared if pieces is mesh else None).max()) + 1,
+        _n_components(mesh.cells, shared if pieces is mesh else None),
         euler_characteristic(theirs.facets),
         euler_characteristic(ours.facets),
         lost,
@@ -601,8 +601,7 @@ def _voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
     def count(first: int, stop: int) -> NDArray[np.int64]:
         return np.bincount(rows[first:stop].ravel() + 1, minlength=n + 1)[1:]
 
-    n_slabs = max(rows.size // (8 * (n + 1)), 1)  # all counts take a byte per voxel at most
-    return np.asarray(sum(over_slabs(count, len(rows), rows.size, n_slabs)))
+    return sum_over_slabs(count, len(rows), rows.size, n)
 
 
 def _voxel_dice(
@@ -730,8 +729,8 @@ def _dice(both: float, one: float, other: float) -> float:
     return float(2 * both / (one + other)) if one + other > 0 else 0.0
 
 
-def _n_components(cells: NDArray[np.int64]) -> int:
-    return int(components(cells).max()) + 1 if len(cells) else 0
+def _n_components(cells: NDArray[np.int64], shared: Facets | None = None) -> int:
+    return int(components(cells, shared).max()) + 1 if len(cells) else 0
 
 
 class ImageFit(NamedTuple):

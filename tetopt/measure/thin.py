@@ -207,9 +207,7 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)
-    rows = members.partition.astype(np.int16)
-    if inside is not None:
-        rows[~inside] = BEYOND_REGION
+    rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     thick = local_thickness(members, spacing, most, inside)
     of_voxels = _percentiles(thick, rows, members.labels, most)
     values, row = np.unique(of_cell, return_inverse=True)

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 SLABS_PER_THREAD = 16  # as some take longer than others, and temporaries are as large as a slab
 SLAB_ELEMENTS = 1 << 16  # of a slab at least: waking a thread for fewer takes longer than their work
@@ -37,3 +38,13 @@ def over_slabs(fill: Callable[[int, int], Result], n: int, n_elements: int, most
         return [fill(first, stop) for first, stop in ends]
     with ThreadPoolExecutor(n_threads) as threads:
         return list(threads.map(lambda slab: fill(*slab), ends))
+
+
+def sum_over_slabs(
+    count: Callable[[int, int], NDArray[np.int64]], n: int, n_elements: int, n_counts: int
+) -> NDArray[np.int64]:
+    """Sum the `n_counts` whole numbers that a function counts in each of some slabs; arguments as for `over_slabs`.
+
+    The more numbers, the fewer slabs, so that all counts together take a byte per element at most.
+    """
+    return np.asarray(sum(over_slabs(count, n, n_elements, max(n_elements // (8 * n_counts), 1))))
